@@ -165,6 +165,13 @@ found = jaxcal.calibrate(jaxcal.simulate_recording(jaxcal.Protocol(images=9), 1)
 of_one = backend.Parameters.of(jax.numpy.eye(3), jax.numpy.zeros(3), jax.numpy.zeros(3))
 skewed = np.eye(6) + np.eye(6, k=1)
 assert jaxcal.predicted_tre(result, [0.0, 50.0]).shape == ()
+keep = np.ma.array(np.ones(9, bool), mask=np.arange(9) == 2)
+fewer = jaxcal.Problem.from_arrays(poses, points, mask=keep)
+np.testing.assert_array_equal(fewer.mask, keep.filled(False))
+for mask in (keep.filled(False), keep.filled(False).astype(int)):
+    same = dataclasses.replace(problem, mask=mask)
+    assert same.mask.dtype == float
+    np.testing.assert_array_equal(same.mask, fewer.mask)
 for call, *given in (
     (jaxcal.calibrate, "rec.h5"), (jaxcal.calibrate, {}),
     (jaxcal.calibrate_batch, "rec.h5"), (jaxcal.calibrate_batch, [1]),
@@ -288,7 +295,10 @@ for call, *given in (
         ("spacing", np.array([np.nan, 1.0])), ("spacing", np.ones(3)), ("face_offset", 0.0),
         ("mask", np.ones(5)), ("poses", poses[:, :3]), ("measurements", points.astype(str)),
         ("measurements", points.tolist()), ("measurements", None), ("max_elevation", np.ones(3)),
+        ("mask", np.full(9, 0.5)), ("mask", np.full(9, np.nan)),
     )),
+    *((lambda dtype: jaxcal.Problem.from_arrays(poses, points, dtype=dtype), dtype)
+      for dtype in (int, "points")),
     (lambda mask: jaxcal.calibrate_batch(
         dataclasses.replace(jaxcal.stack([problem]), mask=mask), "conventional"), np.ones((2, 9))),
     (backend.Iterate.of, of_one, backend.RIGID),
@@ -308,7 +318,7 @@ for call, *given in (
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stderr == ""
     lines = done.stdout.splitlines()
-    assert len(lines) == 183
+    assert len(lines) == 187
     assert lines[0].startswith("jaxcal.calibrate takes a problem, not a path: ")
     assert lines[3].startswith("jaxcal.calibrate_batch takes a problem or a recording, not int: ")
     assert lines[4] == "points must have shape (..., 2), not (1, 3)"

@@ -54,6 +54,8 @@ class ProbeStage:
         self._session, self._motion, self._note = session, motion, note
         self._axis = np.asarray(session.setup.scene.elevational, float)
         self.plan_pose = np.eye(4)
+        self._before: Image | None = None
+        """The newest image before the last journey."""
         self._arrived = session.clock.now()
 
     def go_to(self, row: int) -> None:
@@ -67,6 +69,7 @@ class ProbeStage:
             DeviceError: stopped, refused, lost, or a device in lasting trouble.
         """
         self.plan_pose = self._targets[row].copy()
+        self._before = self._session.latest_image()
         try:
             self._move(self.plan_pose, None)
             return
@@ -158,6 +161,8 @@ class ProbeStage:
 
         Raises:
             PlacementError: no credible target in several frames.
+            StaleError: the frame is one of another pose: a frozen screen that is grabbed has new
+                time stamps.
         """
         reason = ""
         for _ in range(_LOOKS):
@@ -165,6 +170,11 @@ class ProbeStage:
             place, within = self._expected_px(row, image)
             found = localise(image.array, "cross", near=place, within_px=within)
             if found.found[0]:
+                if self._before is not None and np.array_equal(image.array, self._before.array):
+                    raise StaleError(
+                        "the image is the one of before the probe moved: is the machine frozen?",
+                        device="ultrasound",
+                    )
                 contrast = float(found.contrast_db[0])
                 columns = image.array.shape[1]
                 return place_of(found.position[0], image.spacing_mm, columns), contrast

@@ -100,6 +100,10 @@ class Guide:
     rules: Rules = field(default_factory=Rules)
     taken: list[Taken] = field(default_factory=list)
     _moment: deque[PosedImage] = field(default_factory=deque)
+    _unchanged: PosedImage | None = None
+    """The first of the images, up to the newest, that are the same to the last pixel."""
+    _stuck: float = -np.inf
+    """Time of the newest image that is the same as one of another place."""
     _tried: float = -np.inf
     _words: str = ""
 
@@ -112,12 +116,17 @@ class Guide:
         if moment and posed.time <= moment[-1].time:
             # The sender's clock was set back.
             self.forget()
+        before = self._unchanged
+        if before is None or not np.array_equal(before.image.array, posed.image.array):
+            self._unchanged = posed
+        elif not self._still(np.array([before.pose, posed.pose])):
+            self._stuck = posed.time
         moment.append(posed)
-        while moment[-1].time - moment[0].time > rules.hold_s * 1.2:
+        # At least two images, however seldom they come.
+        while len(moment) > 2 and moment[-1].time - moment[1].time >= rules.hold_s:
             moment.popleft()
         poses = np.array([each.pose for each in moment])
-        shift, turn = spread_of(poses)
-        if shift > rules.still_mm or turn > rules.still_deg:
+        if not self._still(poses):
             # Keep only the newest poses: the probe may be still from now on.
             while len(moment) > 1 and moment[-1].time - moment[0].time > 0.3 * rules.hold_s:
                 moment.popleft()
@@ -139,7 +148,7 @@ class Guide:
     def forget(self) -> None:
         """Begin a new moment: after an image was taken or taken back."""
         self._moment.clear()
-        self._tried, self._words = -np.inf, ""
+        self._tried, self._words, self._stuck = -np.inf, "", -np.inf
 
     def _judge(self, middle: PosedImage, pose: Float[np.ndarray, "4 4"]) -> Look:
         rules, frame = self.rules, middle.image.array
@@ -147,6 +156,8 @@ class Guide:
         if not located.found[0]:
             return Look(f"no credible target: {located.reason[0]}")
         pixel = located.position[0]
+        if middle.time <= self._stuck:
+            return Look("the image stays the same while the probe moves: is the machine frozen?")
         where = (float(pixel[0]), float(pixel[1]))
         same = self._like(pose, pixel, frame.shape)
         if same is not None:
@@ -157,6 +168,10 @@ class Guide:
             )
         taken = Taken(pose, pixel, located.covariance[0], middle.time, middle)
         return Look(f"taken: {len(self.taken) + 1}", taken, where)
+
+    def _still(self, poses: Float[np.ndarray, "n 4 4"]) -> bool:
+        shift, turn = spread_of(poses)
+        return shift <= self.rules.still_mm and turn <= self.rules.still_deg
 
     def _like(self, pose: np.ndarray, pixel: np.ndarray, shape: tuple[int, ...]) -> int | None:
         """The image that this one does not differ from."""

@@ -267,12 +267,15 @@ class _Run:
         self._inject(now)
 
     def _pose_at(self, t: float) -> np.ndarray | bool:
-        """The pose at a time of arrival; True if it may still come, False if there is none."""
+        """The pose at a time of arrival; True if it may still come, False if there is none.
+
+        Images and poses that a slow link holds up count as of when they would have come otherwise.
+        """
         images = list(self._images)
-        if not images or t > images[-1].image.t_host:
+        if not images or t > images[-1].image.prompt_s:
             return True
         for before, after in pairwise(images):
-            times = np.array([before.image.t_host, after.image.t_host])
+            times = np.array([before.image.prompt_s, after.image.prompt_s])
             if not times[0] <= t <= times[1]:
                 continue
             if before.pose is None or after.pose is None or np.diff(times)[0] > _LONGEST_GAP_S:
@@ -286,7 +289,7 @@ class _Run:
     def _too_fast(self) -> bool:
         """Whether the hand is so fast that the times do not say well enough where it was."""
         first, last = self._images[max(len(self._images) - 4, 0)], self._images[-1]
-        passed = last.image.t_host - first.image.t_host
+        passed = last.image.prompt_s - first.image.prompt_s
         if self._origin is None or first.pose is None or last.pose is None or passed <= 0:
             return False
         moved = abs(self._offset(last.pose) - self._offset(first.pose))
@@ -365,8 +368,11 @@ class _Run:
         title = f"image {self.count + 1} of {self._asked.images}"
         view = self._view()
         late = ""
+        late_s = self._images[-1].image.late_s
         if self._late_s > _LATEST_S:
             late = f"the element's frames are {self._late_s:.1f} s late: look at the link to it"
+        elif late_s > _LATEST_S:
+            late = f"the images are {late_s:.1f} s late: look at the link to the server"
         if view is None:
             reason = self._images[-1].why or "the element is not heard"
             words = f"{title}: {late or f'{reason}: bring the probe over it'}"

@@ -28,7 +28,7 @@ _MORE_S = 0.5
 """How long to listen after both have come, so that all names are known."""
 _LONGEST_GAP_S = 0.2
 _LATEST_S = 0.4
-"""How long an image waits for the pose after it."""
+"""How long an image waits for the pose after it, beyond a negative lag."""
 _SAME_S = 1e-6
 _KEPT = 1024
 _ONE_CLOCK_S = 60.0
@@ -130,7 +130,8 @@ class PosedImages:
             self._take()
             if self._waiting:
                 image, arrived = self._waiting[0]
-                posed = self._posed(image, time.monotonic() - arrived > _LATEST_S)
+                waited = time.monotonic() - arrived
+                posed = self._posed(image, waited > _LATEST_S + max(-self._lag, 0.0))
                 if posed is not None:
                     self._waiting.popleft()
                     return posed

@@ -291,7 +291,7 @@ class Session:
             return self._image
 
     def image_after(self, since: float) -> Image:
-        """The first B-mode frame that arrives after a moment.
+        """The first B-mode frame that arrives after a moment, or would have if it were not late.
 
         Raises:
             DeviceError: trouble while waiting.
@@ -300,7 +300,7 @@ class Session:
         with self._changed:
             while True:
                 image = self._image
-                if image is not None and image.t_host > since and image.array.dtype == np.uint8:
+                if image is not None and image.prompt_s > since and image.array.dtype == np.uint8:
                     return image
                 if self._failure is not None:
                     raise self._failure
@@ -308,7 +308,10 @@ class Session:
                     break
                 self._changed.wait(self.clock.wall(0.1))
         self.check()
-        raise StaleError("no B-mode frame came in time", device="ultrasound")
+        late = image.late_s if image is not None else 0.0
+        what = f"the images are {late:.1f} s late: look at the link to the machine"
+        what = what if late > self.watch.image_age_s else "no B-mode frame came in time"
+        raise StaleError(what, device="ultrasound")
 
     def record_image(self) -> None:
         """Put the newest ultrasound frame into the recording, unless every frame goes there."""

@@ -53,6 +53,7 @@ _TICK_S = 0.02
 _START_PATIENCE_S = 30.0
 # The controller's watchdog has stopped the robot long before; a busy machine gets time to answer.
 _HANGS_WALL_S = 2.0
+_HELD_UP_WALL_S = 0.5
 
 
 class Motion:
@@ -229,10 +230,14 @@ class Motion:
         hesitation: StaleError | None = None
         stopping: DeviceError | None = None
         while True:
+            asked_s = time.monotonic()
             try:
                 answer = self._answers.get(timeout=tick)
             except queue.Empty:
                 answer = {}
+            if time.monotonic() - asked_s > tick + _HELD_UP_WALL_S:
+                # This process was held up, not the other one: what that told is still unread.
+                self._heard = time.monotonic()
             error = error_of(answer)
             match answer.get("what"):
                 case "arrived" if answer["move"] == count and self._stop is None:

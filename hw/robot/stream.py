@@ -29,13 +29,12 @@ from hw.robot._reader import BOUND, ERROR, POSE, RECORD
 from hw.robot.identity import Identity, read_identity
 from hw.robot.pose import ur_to_pose
 from hw.robot.rtde import PendantSettings, too_late
-from hw.runtime.clock import REAL, Clock
+from hw.runtime.clock import REAL, Clock, Lag
 from hw.runtime.errors import LostError, StaleError, refused
 from hw.runtime.rigid import rotation_vector
 from jaxcal.runtime.array_types import Float
 
 _OFFSET_TOLERANCE = 1e-6
-_MOST_DRIFT = 200e-6
 
 
 @dataclass(frozen=True)
@@ -82,34 +81,6 @@ class SteadyPose:
     count: int
     scatter_mm: float
     """Root mean square distance from the average position."""
-
-
-class Lag:
-    """An upper bound of how long a pose was on its way (bench s).
-
-    A pose's host time minus its device time is its lag plus the offset of the two clocks. A lower
-    bound of the offset comes from one pair of times: the pose with this device time was not made
-    before this host time (:attr:`hw.robot.rtde.PacketReader.bound`). A smaller difference seen
-    later replaces it. As clocks drift, the bound is raised by 200 ppm of the time that passes, more
-    than quartz clocks differ by; a lag that grows faster than that is still seen.
-
-    Args:
-        t_host: of the pair, bench s; without a pair, lags count from the smallest one seen.
-        t_device: of the pair, s.
-    """
-
-    def __init__(self, t_host: float = math.inf, t_device: float = 0.0) -> None:
-        self._floor = t_host - t_device
-        self._last = t_host
-
-    def of(self, t_host: float, t_device: float) -> float:
-        """Take a pose's times; returns its lag."""
-        difference = t_host - t_device
-        if math.isfinite(self._last):
-            self._floor += _MOST_DRIFT * max(t_host - self._last, 0.0)
-        self._last = t_host
-        self._floor = min(self._floor, difference)
-        return difference - self._floor
 
 
 class PoseStream:

@@ -11,6 +11,8 @@ import math
 import time
 from dataclasses import dataclass, field
 
+_MOST_DRIFT = 200e-6
+
 
 @dataclass(frozen=True)
 class Clock:
@@ -59,3 +61,31 @@ class Clock:
 
 REAL = Clock()
 """The clock of a real bench; its zero is the import of this module."""
+
+
+class Lag:
+    """An upper bound of how long something was on its way (bench s).
+
+    Its host time minus its device time is its lag plus the offset of the two clocks. A lower
+    bound of the offset comes from one pair of times: what has this device time was not made
+    before this host time (:attr:`hw.robot.rtde.PacketReader.bound`). A smaller difference seen
+    later replaces it. As clocks drift, the bound is raised by 200 ppm of the time that passes, more
+    than quartz clocks differ by; a lag that grows faster than that is still seen.
+
+    Args:
+        t_host: of the pair, bench s; without a pair, lags count from the smallest one seen.
+        t_device: of the pair, s.
+    """
+
+    def __init__(self, t_host: float = math.inf, t_device: float = 0.0) -> None:
+        self._floor = t_host - t_device
+        self._last = t_host
+
+    def of(self, t_host: float, t_device: float) -> float:
+        """Take the times of a pose or an image; returns its lag."""
+        difference = t_host - t_device
+        if math.isfinite(self._last):
+            self._floor += _MOST_DRIFT * max(t_host - self._last, 0.0)
+        self._last = t_host
+        self._floor = min(self._floor, difference)
+        return difference - self._floor

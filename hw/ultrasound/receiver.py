@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hw.runtime.clock import REAL, Clock
+from hw.runtime.clock import REAL, Clock, Lag
 from hw.runtime.errors import Device, DeviceError, LostError, StaleError
 from hw.ultrasound.framing import MessageDecoder
 from jaxcal.io.message_content import Picture, Pixels, StatusMessage, Tracked, TrackedFrame
@@ -46,6 +46,8 @@ class Image:
         array: (height, width) uint8 B-mode, or int16; rows downwards; not writable.
         spacing_mm: [lateral, axial] mm per pixel.
         device: name of the sender's device.
+        late_s: how much longer it was on its way than the quickest image, s of the bench's clock,
+            by the time stamps; 0 where the machine sends none.
     """
 
     t_host: float
@@ -54,6 +56,12 @@ class Image:
     array: Pixels
     spacing_mm: tuple[float, float]
     device: str
+    late_s: float = 0.0
+
+    @property
+    def prompt_s(self) -> float:
+        """When it would have come by a link as quick as for the quickest image, bench s."""
+        return self.t_host - self.late_s
 
     @property
     def is_rf(self) -> bool:
@@ -143,7 +151,7 @@ class UltrasoundStream:
         self._transforms: deque[Transform] = deque(maxlen=4096)
         self._status: StatusMessage | None = None
         self._counts = UltrasoundStatistics()
-        self._last: dict[str, tuple[int, float]] = {}
+        self._last: dict[str, tuple[int, float, Lag]] = {}
         self._other_devices: set[str] = set()
         self._failure: LostError | None = None
         self._stopping = False
@@ -302,14 +310,18 @@ class UltrasoundStream:
 
     def _take_image(self, message: Message, picture: Picture) -> None:
         counts = self._counts
-        number, stamp = self._last.get(message.device, (0, math.nan))
+        number, stamp, lag = self._last.get(message.device, (0, math.nan, Lag()))
         if message.t_device == stamp:
             counts.repeated += 1
             return
         if message.message_id and 0 < number < message.message_id:
             counts.lost += message.message_id - number - 1
-        self._remember(message)
+        if message.t_device < stamp:
+            # The machine's clock was set back.
+            lag = Lag()
+        self._remember(message, lag)
         counts.received += 1
+        late_s = lag.of(message.t_host, message.t_device)
         image = Image(
             t_host=message.t_host,
             t_device=message.t_device,
@@ -317,6 +329,7 @@ class UltrasoundStream:
             array=picture.array,
             spacing_mm=picture.spacing_mm,
             device=message.device,
+            late_s=late_s if math.isfinite(late_s) else 0.0,
         )
         self._images.append(image)
         self._bytes += image.array.nbytes
@@ -326,13 +339,13 @@ class UltrasoundStream:
             self._bytes -= self._images.popleft().array.nbytes
             counts.dropped += 1
 
-    def _remember(self, message: Message) -> None:
-        """Keep number and time stamp of a device's last image, for at most 64 devices.
+    def _remember(self, message: Message, lag: Lag) -> None:
+        """Keep number, time stamp and lag of a device's last image, for at most 64 devices.
 
         A peer may invent devices without end.
         """
         self._last.pop(message.device, None)
-        self._last[message.device] = (message.message_id, message.t_device)
+        self._last[message.device] = (message.message_id, message.t_device, lag)
         if len(self._last) > 64:
             del self._last[next(iter(self._last))]
 

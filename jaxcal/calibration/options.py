@@ -369,7 +369,7 @@ def check_shapes(problem: Problem) -> None:
             continue
         kind = getattr(getattr(value, "dtype", None), "kind", "")
         # bfloat16 and its like are of numpy's kind V.
-        if value is None or kind not in ("b", "i", "u", "f", "V"):
+        if value is None or kind not in ("f", "V"):
             raise InputError(f"{name} of the problem must be an array of real numbers")
         if np.shape(value) != wanted:
             raise InputError(
@@ -381,12 +381,15 @@ def check_values(problem: Problem) -> None:
     """Refuse NaN, Inf and too few images, if the values are concrete.
 
     Raises:
-        InputError: NaN or Inf, with the number of the image, too few images, or pixels without a
-            size.
+        InputError: a mask of other numbers than 0 and 1, NaN or Inf, with the number of the image,
+            too few images, or pixels without a size.
     """
     if is_traced(problem):
         return
-    used = np.asarray(problem.mask) > 0
+    mask = np.asarray(problem.mask)
+    if not np.isin(mask, (0, 1)).all():
+        raise InputError("mask of the problem must hold 1 (used) or 0 (left out) for every image")
+    used = mask > 0
     if used.sum() < MINIMUM_IMAGES:
         raise InputError(
             f"{int(used.sum())} used images are too few: at least {MINIMUM_IMAGES} are needed"

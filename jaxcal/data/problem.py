@@ -19,6 +19,7 @@ from jaxcal.data.recording import Images, Kind, Recording, images_of, make_image
 from jaxcal.runtime import buckets
 from jaxcal.runtime.array_types import AnyArray, Float, HeldArray
 from jaxcal.runtime.arrays import array_module, is_traced
+from jaxcal.runtime.messages import shown
 from jaxcal.runtime.precision import importing_jax, in_own_modes
 from jaxcal.runtime.trees import array_tree, assembled, static
 
@@ -80,6 +81,12 @@ class Problem:
     pixels: bool = static(default=False)
     spacing_known: bool = static(default=True)
     curved: bool = static(default=False)
+
+    def __post_init__(self) -> None:
+        # dataclasses.replace(problem, mask=keep) with a mask of booleans, for example.
+        for name, value in vars(self).items():
+            if getattr(getattr(value, "dtype", None), "kind", "") in ("b", "i", "u"):
+                object.__setattr__(self, name, value.astype(float))
 
     @property
     def images(self) -> int:
@@ -143,11 +150,12 @@ class Problem:
             dtype: float64 by default.
 
         Raises:
-            InputError: for times of flight that cannot be segmented, or come without a probe.
+            InputError: for times of flight that cannot be segmented, or come without a probe, and
+                for a dtype that is not floating.
         """
         probe = recording.probe if isinstance(recording, Recording) else None
         images = images_of(recording, "jaxcal.Problem.from_recording")
-        dtype = np.float64 if dtype is None else dtype
+        dtype = _floating(dtype)
 
         # device_put, since JAX would compile jax.numpy.asarray of a number.
         put: Any = sys.modules["jax"].device_put if "jax" in sys.modules else lambda array: array
@@ -226,6 +234,16 @@ class Problem:
             spacing_mm=spacing_mm,
         )
         return cls.from_recording(images, dtype=dtype)
+
+
+def _floating(dtype: DTypeLike | None) -> np.dtype:
+    try:
+        found = np.dtype(np.float64 if dtype is None else dtype)
+    except TypeError:
+        found = np.dtype(object)
+    if found.kind not in "fV":  # bfloat16 and its like are of numpy's kind V
+        raise InputError(f"dtype must be a floating one, e.g. numpy.float32, not {shown(dtype)}")
+    return found
 
 
 def fill_up(problem: Problem) -> Problem:

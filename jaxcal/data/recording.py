@@ -363,7 +363,7 @@ def _mask(mask: np.ndarray | None, count: int) -> Bool[np.ndarray, " n"]:
     if mask is None:
         return np.ones(count, bool)
     try:
-        mask = np.asarray(mask)
+        mask = np.ma.filled(mask, False)  # a masked entry is left out
     except ValueError:
         raise InputError("mask must be an array of booleans (True = used)") from None
     if mask.shape != (count,):

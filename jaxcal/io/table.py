@@ -45,38 +45,30 @@ class Table:
         """Where a row stands, for a message."""
         return f"{self.name}:{self.lines[row]}"
 
-    def number(self, row: int, column: int) -> float:
-        """One cell as a number, NaN and Inf included.
-
-        Raises:
-            FormatError: not a number; file, line and column are named.
-        """
-        text = self.rows[row][column]
-        value = parse_number(text, decimal_comma=self.separator != ",")
-        if value is None:
-            raise FormatError(
-                f"{self.row(row)}: {self.column(column)} is not a number: {quoted(text)}"
-            )
-        return value
-
     def numbers(
-        self, columns: tuple[int, ...], rows: list[int] | None = None
+        self, columns: tuple[int, ...], rows: list[int] | None = None, *, finite: bool = True
     ) -> Float[np.ndarray, "rows columns"]:
-        """Finite numbers of some columns.
+        """Numbers of some columns.
+
+        Args:
+            columns: which.
+            rows: which; by default all.
+            finite: refuse NaN and Inf.
 
         Raises:
-            FormatError: not a number, NaN or Inf; file, line and column are named.
+            FormatError: not a number, or NaN or Inf; file, line and column are named.
         """
         chosen = range(len(self.rows)) if rows is None else rows
         values = np.empty((len(chosen), len(columns)))
         for place, row in enumerate(chosen):
-            for position, column in enumerate(columns):
-                value = self.number(row, column)
-                if not math.isfinite(value):
-                    raise FormatError(
-                        f"{self.row(row)}: {self.column(column)} is {self.rows[row][column]}"
-                    )
-                values[place, position] = value
+            texts = [self.rows[row][column] for column in columns]
+            found = parse_numbers(texts, decimal_comma=self.separator != ",")
+            for column, text, value in zip(columns, texts, found, strict=True):
+                if value is not None and (math.isfinite(value) or not finite):
+                    continue
+                why = f"is {text}" if value is not None else f"is not a number: {quoted(text)}"
+                raise FormatError(f"{self.row(row)}: {self.column(column)} {why}")
+            values[place] = found
         return values
 
     def column(self, column: int) -> str:
@@ -87,10 +79,17 @@ class Table:
 
 def parse_number(text: str, *, decimal_comma: bool = False) -> float | None:
     """A number as programs write it, or None; never ``1_000``."""
-    text = text.strip()
-    if decimal_comma and _DECIMAL_COMMA.fullmatch(text):
-        text = text.replace(",", ".")
-    return float(text) if _NUMBER.fullmatch(text) else None
+    return parse_numbers([text], decimal_comma=decimal_comma)[0]
+
+
+def parse_numbers(texts: list[str], *, decimal_comma: bool = False) -> list[float | None]:
+    """Numbers as programs write them, each or None."""
+    found: list[float | None] = []
+    for text in map(str.strip, texts):
+        if decimal_comma and _DECIMAL_COMMA.fullmatch(text):
+            text = text.replace(",", ".")
+        found.append(float(text) if _NUMBER.fullmatch(text) else None)
+    return found
 
 
 def read_table(

@@ -261,11 +261,7 @@ def _fixed(
             f"{table.row(0)}: {width} columns; {' or '.join(map(str, widths))} are needed "
             f"({columns}, separated by white space)"
         )
-    if finite:
-        return table.numbers(tuple(range(width)))
-    return np.array(
-        [[table.number(row, column) for column in range(width)] for row in range(len(table.rows))]
-    )
+    return table.numbers(tuple(range(width)), finite=finite)
 
 
 def _columns(table: Table, quaternion: QuaternionOrder | None) -> Columns:
@@ -304,7 +300,7 @@ def _used_rows(table: Table, columns: Columns, skip_invalid: bool) -> tuple[list
     pose, comma = columns.quaternion or columns.matrix or (), table.separator != ","
     kept: list[int] = []
     for row, cells in enumerate(table.rows):
-        missing = next((k for k in needed if _missing(cells[k])), None)
+        missing = _first_missing(cells, needed)
         if columns.valid is not None and not _is_valid(table, row, columns.valid):
             why = f"the row is marked as invalid ({quoted(cells[columns.valid])})"
         elif missing is not None:
@@ -321,8 +317,13 @@ def _used_rows(table: Table, columns: Columns, skip_invalid: bool) -> tuple[list
     return kept, len(table.rows) - len(kept)
 
 
-def _missing(cell: str) -> bool:
-    return cell.startswith("#") or cell.lower().lstrip("+-") in _MISSING
+def _first_missing(cells: list[str], columns: list[int]) -> int | None:
+    """The first of the columns whose cell holds no number, as programs mark it; None: all do."""
+    for column in columns:
+        cell = cells[column]
+        if cell.startswith("#") or cell.lower().lstrip("+-") in _MISSING:
+            return column
+    return None
 
 
 def _is_valid(table: Table, row: int, column: int) -> bool:

@@ -119,12 +119,15 @@ def messages(asked: dict):
         asked: as of :func:`stream`; ``mode``: ``tracked`` or ``separate`` messages; ``metres``:
             send translations in m; ``cut_after``: number of the frame from which on frames are
             smaller; ``deeper_after``: from which on their pixels are larger; ``back_after``: from
-            which on the server's clock is an hour behind; ``second``: name of a further device,
-            whose images nothing shows.
+            which on the server's clock is an hour behind; ``frozen``: numbers of the first and the
+            last frame that show the one before them; ``second``: name of a further device, whose
+            images nothing shows.
     """
-    number = 0
+    number, shown = 0, None
+    first, last = asked.get("frozen", (0, -1))
     for stamp, array, transforms in stream(asked):
         number += 1
+        shown = array = shown if shown is not None and first <= number <= last else array
         spacing = (2.0, 2.0) if number > asked.get("deeper_after", number) else (1.0, 1.0)
         stamp -= 3600.0 if number > asked.get("back_after", number) else 0.0
         if number > asked.get("cut_after", number):

@@ -13,7 +13,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from plus_server import COLUMNS, ROWS, SPACING_MM, TARGET_MM, holds, image_to_probe
+from plus_server import COLUMNS, ROWS, SPACING_MM, TARGET_MM, frame, holds, image_to_probe
 from scipy.spatial.transform import Rotation
 
 import jaxcal
@@ -114,6 +114,23 @@ def check(path: Path, order: list[int], seed: int = 1, count: int = 9) -> None:
     assert np.abs(error).max() < 0.6
     found = np.einsum("ni,nij,nj->n", error, np.linalg.inv(images.covariance[used]), error)
     assert found.mean() < 8
+
+
+def test_a_run_from_the_command_line(tmp_path, capsys, monkeypatch, tracked):
+    """Up to the calibration, which takes ten times as long; its exit status is the command's."""
+    path, calibrated = tmp_path / "rec.h5", []
+
+    def calibrate(path: str) -> dict[str, bool]:
+        calibrated.append(path)
+        return {"converged": False}
+
+    monkeypatch.setattr("hw.acquisition.outcome.calibrate_and_print", calibrate)
+    assert main(["free-hand", f"127.0.0.1:{tracked}", str(path), "--images", "5"]) == 3
+    told = capsys.readouterr()
+    assert "poses from Probe to Reference" in told.err
+    assert "image 5/5" in told.err
+    assert calibrated == [str(path)]
+    check(path, list(range(5)))
 
 
 @pytest.mark.slow
@@ -284,6 +301,15 @@ def test_a_servers_clock_that_is_set_back_is_no_end(tmp_path, plus_server):
     check(tmp_path / "r.h5", [0, 1, 2, 4])
 
 
+def test_a_machine_that_is_frozen_has_no_image_taken(tmp_path, plus_server):
+    """Its screen is grabbed with new time stamps: one target's pixel was taken at every pose."""
+    person = Scripted()
+    port = plus_server(mode="tracked", frozen=[30, 110])
+    assert acquire_free_hand(tmp_path / "r.h5", FreeHand("127.0.0.1", port, images=5), person) == 5
+    assert "the image stays the same while the probe moves: is the machine frozen?" in person.words
+    check(tmp_path / "r.h5", [0, 1, 5, 6, 7])
+
+
 @pytest.mark.parametrize(
     "option",
     [
@@ -390,8 +416,31 @@ def test_poses_between_stamps(separate):
         np.testing.assert_allclose(each.pose, expected, atol=2e-3)
 
 
+def test_an_image_waits_for_the_pose_of_a_negative_lag(separate):
+    """With -0.5 s no image had one: its transforms were said to have stopped coming."""
+    with UltrasoundStream("127.0.0.1", separate) as stream:
+        # The stream's stamps run six times as fast as the clock on the wall.
+        images = PosedImages(stream, lag_s=-4.0)
+        assert images.read(3.0).pose is not None
+
+
 def still(pose: np.ndarray, t: float, frame: np.ndarray) -> PosedImage:
     return PosedImage(Image(t, t, 1, frame, (1.0, 1.0), "Image"), t, pose)
+
+
+@pytest.mark.parametrize("period_s", [0.05, 0.4, 0.5, 1.0])
+def test_an_image_is_taken_however_seldom_images_come(period_s):
+    rng = np.random.default_rng(0)
+    (pose, *_), (pixel, *_) = holds(3, 1)
+    guide = Guide()
+    seen = []
+    for number in range(14):
+        shaken = pose.copy()
+        shaken[:3, 3] += rng.normal(0, 0.03, 3)
+        seen.append(guide.look(still(shaken, period_s * number, frame(rng, pixel))))
+    taken = [look.taken.time for look in seen if look.taken is not None]
+    assert taken
+    assert taken[0] <= 1.0
 
 
 def test_advice_names_what_is_missing():

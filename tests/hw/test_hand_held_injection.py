@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import threading
 import time
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +25,8 @@ from hw.bench.ultrasound import ImageServer
 from hw.bench.world import make_world
 from hw.cli.main import main
 from hw.freehand.guide import Rules
-from hw.freehand.injection import acquire_by_injection, hand_advice
+from hw.freehand.injection import _Run, acquire_by_injection, hand_advice
+from hw.freehand.posed import PosedImage
 from hw.freehand.request import FreeHand, FreeHandStopped
 from hw.midplane.pattern_injection import View
 from hw.planning.poses import Extent, plan_poses
@@ -32,6 +34,7 @@ from hw.recording.layout import RecordingHeader
 from hw.recording.recorder import Recorder
 from hw.runtime.clock import REAL
 from hw.setup.description import HandHeldSetup, load_hand_held
+from hw.ultrasound import Image
 from jaxcal import InputError
 
 WORLD = make_world(3)
@@ -301,6 +304,21 @@ def test_frames_of_the_element_that_are_late_are_not_used_and_told_of(tmp_path):
             acquire_by_injection(tmp_path / "r.h5", bench.asked, setup, Waiting(bench.hand))
         between.close()
     assert re.search(told, "\n".join(shown))
+
+
+def test_poses_that_a_slow_link_holds_up_are_not_those_of_the_frames_that_come_meanwhile():
+    """The hand moves at 5 mm/s, and images and poses come half a second late: it was 2.5 mm on."""
+    run = object.__new__(_Run)
+    run._images = deque()
+    for t in np.arange(0.0, 2.0, 0.05):
+        pose = np.eye(4)
+        pose[0, 3] = 5.0 * t
+        image = Image(t + 0.5, t, 1, np.zeros((2, 2), np.uint8), (1.0, 1.0), "Image", 0.5)
+        run._images.append(PosedImage(image, t, pose))
+    pose = run._pose_at(1.01)
+    assert not isinstance(pose, bool)
+    assert pose[0, 3] == pytest.approx(5.05)
+    assert run._pose_at(2.1) is True
 
 
 SETUP = """

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import queue
 import signal
 import subprocess
 import sys
@@ -351,3 +352,22 @@ def test_a_safety_stop_that_is_over_when_the_mover_looks_ends_motion():
             until_ended(motion)
         with pytest.raises(RefusedError, match="confirm the plan again"):
             motion.move_to(HOME)
+
+
+def test_a_caller_that_was_stopped_itself_blames_nobody(monkeypatch):
+    """Ctrl-Z, or a suspended machine: what the motion process told meanwhile is still unread."""
+    monkeypatch.setattr("hw.robot.motion._HANGS_WALL_S", 0.0)
+    motion = Motion("127.0.0.2", PLAN, None)
+    told = {"what": "error", "kind": "StaleError", "text": "silent", "ended": False, "move": 1}
+
+    class Stopped(queue.SimpleQueue):
+        def get(self, block: bool = True, timeout: float | None = None) -> dict:
+            if not self.qsize():
+                time.sleep(0.7)
+                self.put(told)
+                raise queue.Empty
+            return super().get(block, timeout)
+
+    motion._answers, motion._heard = Stopped(), time.monotonic()
+    with pytest.raises(StaleError, match="silent"):
+        motion._wait(1)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import re
 import subprocess
 import sys
+from collections.abc import Iterable
 from dataclasses import asdict, replace
 from types import SimpleNamespace
 
@@ -22,7 +22,7 @@ from hw.bench.frames import COLUMNS, DECIBELS, Camera
 from hw.bench.look import Look
 from hw.bench.phantoms import ActiveEcho, Hydrophone, phantom_named
 from hw.bench.stage import WorldStage
-from hw.bench.world import make_world
+from hw.bench.world import World, make_world
 from hw.midplane.amplitude_scan import amplitude_scan, fit_peak
 from hw.midplane.image_scan import ImageBench, image_scan, pixel_of, place_of
 from hw.planning.poses import plan_poses
@@ -31,8 +31,10 @@ from hw.recording.layout import RecordingHeader
 from hw.recording.recorder import Recorder
 from hw.recording.session import Session
 from hw.robot.motion import Motion
+from hw.robot.stream import PoseSample
 from hw.runtime.choices import PHANTOMS
 from hw.runtime.clock import Clock
+from hw.runtime.errors import StaleError
 from hw.ultrasound.receiver import Image
 from jaxcal import InputError
 from jaxcal.data.segmentation.image import localise
@@ -277,37 +279,73 @@ def test_frames_behind_the_probe_show_nothing():
         assert not localise(frame).found[0]
 
 
+class Resting(Motion):
+    """Arrives at once."""
+
+    def __init__(self) -> None:
+        pass
+
+    def check(self) -> None:
+        pass
+
+    def move_to(self, pose: np.ndarray, speed_mm_s: float | None = None) -> PoseSample:
+        return PoseSample(0.0, 0.0, (0.0,) * 6, 1, 7, 1)
+
+
+class Seen(Session):
+    """Shows one image after the other, with the target at [3, 45] mm.
+
+    Args:
+        world: where the target is.
+        pose: of the probe.
+        images: (array, size of its pixels in those of the camera).
+    """
+
+    def __init__(
+        self, world: World, pose: np.ndarray, images: Iterable[tuple[np.ndarray, float]]
+    ) -> None:
+        truth, self._images = world.target(pose), iter(images)
+        scene = SimpleNamespace(elevational=[0.0, 1.0, 0.0], expected=lambda _: truth)
+        self.setup, self.clock = SimpleNamespace(scene=scene), Clock()
+        self._spacing_mm = Camera(world, QUIET).spacing_mm
+
+    def latest_image(self) -> Image:
+        array, times = next(self._images)
+        lateral, axial = self._spacing_mm
+        return Image(0.0, 0.0, 1, array, (times * lateral, times * axial), "Image")
+
+    def image_after(self, since: float) -> Image:
+        return self.latest_image()
+
+    def wait_until_clear(self) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+
 def test_a_depth_that_is_changed_between_two_frames_does_not_move_the_target():
     """Size of the frame and of its pixels are taken from the frame in which it is found."""
     world = make_world(0, phantom="cross-wire", response_mm=0.0)
     camera, pose = Camera(world, QUIET), placed(world, 3.0, 0.0, 45.0)
     frame = camera.frame(pose, np.random.default_rng(0))
-    seen = [(frame, 1.0), (np.ascontiguousarray(frame[::2, ::2]), 2.0)]
-    count, truth = itertools.count(), world.target(pose)
-
-    class Seen(Session):
-        def __init__(self) -> None:
-            scene = SimpleNamespace(elevational=[0.0, 1.0, 0.0], expected=lambda _: truth)
-            self.setup, self.clock = SimpleNamespace(scene=scene), Clock()
-
-        def image_after(self, since: float) -> Image:
-            number = next(count)
-            array, times = seen[number % 2]
-            lateral, axial = camera.spacing_mm
-            return Image(0.0, 0.0, number, array, (times * lateral, times * axial), "Image")
-
-        def close(self) -> None:
-            pass
-
-    class Resting(Motion):
-        def __init__(self) -> None:
-            pass
-
-        def check(self) -> None:
-            pass
-
-    stage = ProbeStage(Seen(), Resting(), pose[None], lambda kind, text: None)
-    for _ in seen:
+    images = [(frame, 1.0), (np.ascontiguousarray(frame[::2, ::2]), 2.0)]
+    stage = ProbeStage(Seen(world, pose, images), Resting(), pose[None], lambda kind, text: None)
+    for _ in images:
         place, _ = stage.locate(0)
         np.testing.assert_allclose(place, [3.0, 45.0], atol=0.3)
-        next(count)
+
+
+def test_a_frame_of_before_the_probe_moved_is_not_measured():
+    """A frozen machine whose screen is grabbed sends it again and again, with new time stamps."""
+    world = make_world(0, phantom="cross-wire", response_mm=0.0)
+    camera, pose = Camera(world, QUIET), placed(world, 3.0, 0.0, 45.0)
+    before = camera.frame(pose, np.random.default_rng(0))
+    now = np.maximum(before, 1)
+    images = ((array, 1.0) for array in (before, now, before, before.copy()))
+    stage = ProbeStage(Seen(world, pose, images), Resting(), pose[None], lambda kind, text: None)
+    stage.go_to(0)
+    stage.locate(0)
+    stage.go_to(0)
+    with pytest.raises(StaleError, match="before the probe moved: is the machine frozen"):
+        stage.locate(0)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import socket
+import threading
 import time
+from contextlib import suppress
 
 import h5py
 import numpy as np
@@ -41,6 +44,55 @@ def test_the_period_of_frames_is_the_devices(rate_hz, missed):
     assert frame_period(frames, hz) == pytest.approx(1.0 / rate_hz, rel=0.01)
     assert frame_period(frames[:1], hz) is None
     assert frame_period(frames[::-1], hz) is None
+
+
+class Link:
+    """A network between client and server that holds back for ``delay_s`` what the server sends."""
+
+    def __init__(self, server: ImageServer) -> None:
+        self.delay_s = 0.0
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self._server = server.host, server.port
+        self.address = self._listener.getsockname()
+        threading.Thread(target=self._carry, daemon=True).start()
+
+    def _carry(self) -> None:
+        held: list[tuple[float, bytes]] = []
+        with self._listener, socket.create_connection(self._server) as server:
+            client, _ = self._listener.accept()
+            server.settimeout(0.005)
+            with client, suppress(BrokenPipeError, ConnectionResetError):
+                while True:
+                    with suppress(TimeoutError):
+                        held.append((time.monotonic() + self.delay_s, server.recv(65536)))
+                    while held and held[0][0] <= time.monotonic():
+                        client.sendall(held.pop(0)[1])
+
+
+def test_an_image_that_a_slow_link_holds_up_is_not_of_the_next_pose(tmp_path):
+    """The robot arrived after it was made: a target's place was measured at the wrong pose."""
+    scene = Scene(np.eye(4), np.array([400.0, -100.0, 0.0]), np.array([0.0, 0.0, -1.0]))
+    with (
+        EmulatedRobot() as robot,
+        AuspisEmulator(silence, clock=robot.clock, lines=8) as emulator,
+        ImageServer(
+            lambda t: np.full((40, 30), int(1000 * t) % 256, np.uint8), clock=robot.clock
+        ) as machine,
+        Recorder(tmp_path / "r.h5", RecordingHeader("pixel", {}, 8, None, "{}")) as recorder,
+    ):
+        link = Link(machine)
+        setup = Setup(
+            robot.host, emulator.path, scene, {}, link.address,
+            probe=LinearProbe(elements=8), clock=robot.clock,
+        )  # fmt: skip
+        with Session(setup, recorder) as session:
+            session.image_after(robot.clock.now())
+            link.delay_s = 0.7
+            time.sleep(1.0)
+            arrived = robot.clock.now()
+            image = session.image_after(arrived)
+    assert image.t_device - 1_000_000.0 > arrived - 0.2
+    assert image.late_s == pytest.approx(robot.clock.speed * 0.7, abs=0.2)
 
 
 def test_images_of_a_machine_that_also_sends_rf(tmp_path):

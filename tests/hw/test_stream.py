@@ -22,8 +22,8 @@ from hw.bench.rtde import RtdeServer
 from hw.robot.identity import read_identity
 from hw.robot.pose import ur_to_pose
 from hw.robot.rtde import PacketReader, PendantSettings, safety_text
-from hw.robot.stream import Lag, PoseSample, PoseStream, average
-from hw.runtime.clock import Clock
+from hw.robot.stream import PoseSample, PoseStream, average
+from hw.runtime.clock import Clock, Lag
 from hw.runtime.errors import LostError, RefusedError, StaleError
 
 

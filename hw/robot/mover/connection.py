@@ -16,7 +16,7 @@ from hw.robot.mover.messages import Setup
 from hw.robot.mover.no_reconnect import NoReconnect
 from hw.robot.path_checks import check_plan
 from hw.robot.rtde import PROGRAM_RUNS, PacketReader, safety_text, state_text, too_late
-from hw.robot.stream import Lag
+from hw.runtime.clock import Lag
 from hw.runtime.errors import LostError, refused
 from hw.runtime.extras import require
 

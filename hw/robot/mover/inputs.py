@@ -15,8 +15,8 @@ from collections import deque
 from hw.robot.mover.messages import Caller
 from hw.robot.mover.stop_latch import Ended, Stop, StopLatch
 from hw.robot.rtde import Packet, PacketReader, PendantSettings
-from hw.robot.stream import Lag, PoseSample, offset_changed
-from hw.runtime.clock import Clock
+from hw.robot.stream import PoseSample, offset_changed
+from hw.runtime.clock import Clock, Lag
 from hw.runtime.errors import LostError, StaleError, StoppedError, refused
 
 _RECONNECTS = ("econnect", "Lost connection", "Could not receive", "closed the connection")
