@@ -141,6 +141,17 @@ def test_masked_images_beyond_the_bucket_change_nothing(name, problems):
     holds()
 
 
+def test_images_left_out_between_others_change_nothing(problems):
+    problem = problems[1]
+    first = [0, 2, 4, 5, 6, 8, 9, 10, 11, 13, 14, 15]
+    rows = [first.index(k) if k in first else 0 for k in range(16)]
+    spread = jax.tree.map(jnp.asarray, taken(problem, rows))
+    spread = replace(spread, mask=jnp.zeros(16).at[np.array(first)].set(1.0))
+    found = jaxcal.calibrate(spread).numpy()
+    found = buckets.each_image(found, lambda values, axis: np.take(values, first, axis))
+    same(jaxcal.calibrate(problem), found, 12)
+
+
 def test_the_answer_is_that_of_the_unpadded_problem(problems):
     nine = select(problems[0], slice(0, 9))
     nine, plan, given = prepare(nine, Request(method="conventional"))
