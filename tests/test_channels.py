@@ -165,19 +165,20 @@ def test_missing_and_late_lines_do_no_harm():
 
 def test_distances_that_no_element_heard_are_never_read():
     problem = jaxcal.Problem.from_recording(recording(CURVED))
-    # One pose twice: such frames count as one image, the mean of their distances.
-    poses = np.array(problem.poses)
-    poses[1] = poses[0]
     channels = problem.channels
     assert channels is not None
-    lost = np.random.default_rng(1).random(channels.distances.shape) < 0.2
+    # One image twice, with other noise: such frames count as one, the mean of their distances.
+    poses, measured = np.array(problem.poses), np.array(problem.measurements)
+    twice = np.array(channels.distances)
+    poses[1], measured[1], twice[1] = poses[0], measured[0] + 0.1, twice[0] + 0.1
+    problem = replace(problem, poses=jnp.asarray(poses), measurements=jnp.asarray(measured))
+    lost = np.random.default_rng(1).random(twice.shape) < 0.2
 
     def solved(instead: float) -> jaxcal.Calibration:
-        distances = np.where(lost, instead, channels.distances)
+        distances = np.where(lost, instead, twice)
         heard = np.where(lost, 0.0, channels.heard)
         changed = replace(channels, distances=jnp.asarray(distances), heard=jnp.asarray(heard))
-        told = replace(problem, poses=jnp.asarray(poses), channels=changed)
-        return jaxcal.calibrate(told, prior="gaussian")
+        return jaxcal.calibrate(replace(problem, channels=changed), prior="gaussian")
 
     plain, rubbish = solved(0.0), solved(np.nan)
     assert plain.status == rubbish.status == "converged"
