@@ -58,7 +58,6 @@ def data_of(name: str, row: int) -> Data:
         np.ones(2),
         covariance,
         arrays.get("max_elevation"),
-        order=np.flatnonzero(used),
     )
     if family.probe is None:
         return data
@@ -318,8 +317,9 @@ AVERAGED = [("points12", row) for row in (0, 2, 3, 10)] + [
     ("covariances-bounds12", 0),
     ("pixels24", 1),
 ]
-"""Among them little trust in the mean (points12 10, with gaps; points24 27; pixels24 1), a probable
-mean (bounds24 35), and own covariances that some of the answer rests on (covariances24 20)."""
+"""Among them little trust in the mean (points12 10, where images are left out between others;
+points24 27; pixels24 1), a probable mean (bounds24 35), and own covariances that some of the answer
+rests on (covariances24 20)."""
 
 
 def assert_average(answer: corpus.Arrays, found: model_average.Average, tolerance: float) -> None:

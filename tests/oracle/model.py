@@ -32,7 +32,6 @@ class Data:
         distances: (n, elements) one-way distances at nominal sound speed, mm, or None.
         heard: (n, elements) which of them count.
         elements: (elements, 3) mm.
-        order: (n,) numbers of the images in the order in which they were taken; None: successive.
     """
 
     rotation: np.ndarray
@@ -44,7 +43,6 @@ class Data:
     distances: np.ndarray | None = None
     heard: np.ndarray | None = None
     elements: np.ndarray | None = None
-    order: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.measured)

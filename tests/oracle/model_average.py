@@ -472,7 +472,7 @@ class Average:
 
 def models(data: Data, sigma: np.ndarray, on_channels: bool) -> list[Model]:
     """Common SDs; and the images' own covariances, if they have any, begun with the same SDs."""
-    order = np.arange(len(data)) if data.order is None else data.order
+    order = np.arange(len(data))
     if on_channels:
         heard = np.asarray(data.heard) > 0
         image = [np.broadcast_to(order[:, None], heard.shape)[heard], order]
