@@ -16,8 +16,16 @@ SAMPLE = (
 )
 """One shape; the default path of one problem and of a batch with what both begin with."""
 
+DEFAULT_OF_ALL = [
+    pytest.param(name, call.name, "batch", marks=pytest.mark.slow)
+    for name, calls in corpus.CALLS.items()
+    for call in calls
+    if call.name.startswith("auto") and (name, call.name, "batch") not in SAMPLE
+]
+"""The default of every family: what its own images do to the answer shows in it alone."""
 
-@pytest.mark.parametrize(("name", "call", "road"), SAMPLE)
+
+@pytest.mark.parametrize(("name", "call", "road"), [*SAMPLE, *DEFAULT_OF_ALL])
 def test_answers_are_those_recorded(name, call, road):
     family, answers = corpus.load(name)
     recorded = answers[call, road]
