@@ -23,7 +23,7 @@ from hw.cli.common import (
 from hw.cli.confirming import confirming_by
 from hw.runtime.choices import OPERATORS, PHANTOMS, PLACEMENTS, PLACEMENTS_OF, PLANS
 from jaxcal import InputError
-from jaxcal.cli.common import POSITIVE, ExitCode, exit_code
+from jaxcal.cli.common import POSITIVE, ExitCode, verdict_code
 
 if TYPE_CHECKING:
     from hw.acquisition.acquire import Outcome
@@ -285,4 +285,4 @@ def _finished(path: str, outcome: Outcome, setup: Setup) -> int:
     from hw.acquisition.outcome import calibrate_and_print, lines_of
 
     lines = lines_of(path, outcome, setup.clock.speed)
-    return exit_code([calibrate_and_print(path, *lines)])
+    return verdict_code(calibrate_and_print(path, *lines))

@@ -11,7 +11,7 @@ import click
 from hw.cli.common import check_resumed
 from hw.runtime.choices import HAND_PLACEMENTS
 from jaxcal import InputError
-from jaxcal.cli.common import exit_code
+from jaxcal.cli.common import verdict_code
 from jaxcal.cli.sequence_options import spacing_option
 
 
@@ -128,4 +128,4 @@ def free_hand(
     from jaxcal.runtime.jax_cache import enable_compilation_cache
 
     enable_compilation_cache()
-    return exit_code([calibrate_and_print(path)])
+    return verdict_code(calibrate_and_print(path))

@@ -100,9 +100,9 @@ def calibrate(
         A :class:`Calibration`; read its ``status`` and ``warnings`` before using it. The frames of
         one pose count as one image, and those of frozen tracking are left out
         (:mod:`jaxcal.calibration.dependence`); the others are masked out in the answer and in its
-        ``problem``. Errors that are alike in successive images widen
-        its covariance (:mod:`jaxcal.calibration.serial_correlation`). Both are done for one problem
-        with concrete arrays only; under jit, vmap or grad, and in batches, images are treated as
+        ``problem``. Errors that are alike in successive images widen its covariance
+        (:mod:`jaxcal.calibration.serial_correlation`). All this is done for one problem with
+        concrete arrays only; under jit, vmap or grad, and in batches, images are treated as
         independent.
 
     Raises:

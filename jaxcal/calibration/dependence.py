@@ -61,10 +61,10 @@ ROBUST_FROM = 5
 """From so many frames on, the point of a group is the median of its frames' points."""
 
 MOVED = 0.25
-"""Frames of one pose contradict it if their points differ by this share of all points' spread, and
-by ``LEAST_MOVED``."""
+"""Frames of one pose contradict it if their points differ by more than this share of the spread of
+all points, and by more than ``LEAST_MOVED``."""
 LEAST_MOVED = 3.0
-"""In the points' unit, mm or px: noise of the points, since a share of no spread is nothing."""
+"""px for pixels, mm for points: what noise of the points can do where they hardly differ."""
 
 STREAM = 4.0
 """Least autocorrelation time of a stream, in images."""
@@ -111,7 +111,7 @@ class Independent:
 
     @property
     def words(self) -> list[str]:
-        """What was done, for a person; empty where all images are independent."""
+        """What was done, in a sentence each; empty where all images are used and independent."""
         told = []
         if self.frozen:
             named = ", ".join(map(str, self.frozen[:10])) + ", ..." * (len(self.frozen) > 10)

@@ -15,6 +15,8 @@ import click
 from jaxcal import InputError
 from jaxcal.cli.common import (
     POSITIVE,
+    REQUIRED,
+    WORDS,
     import_engine,
     json_option,
     print_json,
@@ -151,8 +153,8 @@ EXPORTS: tuple[SaveFormat, ...] = ("plus", "slicer", "itk", "ros", "tusrec", "nu
 )
 @click.option(
     "--require",
-    type=click.Choice(["good", "fair", "uncertain"]),
-    default="fair",
+    type=click.Choice(WORDS),
+    default=REQUIRED,
     show_default=True,
     help="Exit with status 5 if the verdict is worse: good is an error up to 0.5 mm at the image, "
     "fair up to 1.5 mm.",

@@ -89,9 +89,11 @@ def exit_code(records: Iterable[dict[str, Any]]) -> ExitCode:
 
 WORDS = ("good", "fair", "uncertain")
 """Verdicts, best first."""
+REQUIRED = "fair"
+"""The worst verdict that ends with status 0, if nothing else is required."""
 
 
-def verdict_code(record: dict[str, Any], required: str) -> ExitCode:
+def verdict_code(record: dict[str, Any], required: str = REQUIRED) -> ExitCode:
     """:func:`exit_code`, and 5 where the verdict is worse than what is required."""
     code = exit_code([record])
     if code or WORDS.index(record["verdict"] or "uncertain") <= WORDS.index(required):

@@ -43,7 +43,11 @@ def kind_of(source: str | os.PathLike[str]) -> str:
 def read_rows(
     source: str | os.PathLike[str], options: ImportOptions, *, ignore_time: bool = False
 ) -> PoseTable:
-    """The table of a source of the kind ``table``."""
+    """The table of a source of the kind ``table``.
+
+    ``ignore_time`` is not taken from the options: times that pair poses or points with frames are
+    always read.
+    """
     return read_pose_table(
         source,
         quaternion=options.quaternion,

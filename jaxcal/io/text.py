@@ -18,7 +18,7 @@ from jaxcal.data.poses import QuaternionOrder, check_poses, rotations_from_quate
 from jaxcal.data.recording import Recording, make_images
 from jaxcal.io.columns import LENGTHS_MM, Columns, LengthUnit, columns_of_header
 from jaxcal.io.readable import naming
-from jaxcal.io.table import Table, has_commented_header, parse_number, read_table
+from jaxcal.io.table import Table, has_commented_header, parse_numbers, read_table
 from jaxcal.runtime.array_types import Float, Int
 from jaxcal.runtime.messages import quoted
 
@@ -305,7 +305,7 @@ def _used_rows(table: Table, columns: Columns, skip_invalid: bool) -> tuple[list
             why = f"the row is marked as invalid ({quoted(cells[columns.valid])})"
         elif missing is not None:
             why = f"{table.column(missing)} is {quoted(cells[missing])[1:-1] or 'empty'}"
-        elif {parse_number(cells[k], decimal_comma=comma) for k in pose} == {0.0}:
+        elif set(parse_numbers([cells[k] for k in pose], decimal_comma=comma)) == {0.0}:
             why = "the rotation is all zeros, as of a tool that was not seen"
         else:
             kept.append(row)
