@@ -282,6 +282,7 @@ for call, *given in (
     (result.save, "x.json", ["json"]), (found.record, 3), (found.record, ["abc"]),
     (found.record, [[1.0, 2.0, 3.0]]), (result.plot_offsets, [1.0, 2.0]),
     (lambda batch: batch.warnings, jaxcal.calibrate_batch([problem], "conventional")),
+    (lambda batch: batch.wrong_frames, jaxcal.calibrate_batch([problem], "conventional")),
     (lambda batch: batch.observability, jaxcal.calibrate_batch([problem], "conventional")),
     (jaxcal.simulate, jax.random.key(1), None),
     (jaxcal.simulate, jax.random.split(jax.random.key(1)), jaxcal.Protocol()),
@@ -303,7 +304,7 @@ for call, *given in (
         ("mask", np.full(9, 0.5)), ("mask", np.full(9, np.nan)),
     )),
     *((lambda dtype: jaxcal.Problem.from_arrays(poses, points, dtype=dtype), dtype)
-      for dtype in (int, "points")),
+      for dtype in (int, "points", np.longdouble)),
     (lambda mask: jaxcal.calibrate_batch(
         dataclasses.replace(jaxcal.stack([problem]), mask=mask), "conventional"), np.ones((2, 9))),
     (backend.Iterate.of, of_one, backend.RIGID),
@@ -323,7 +324,7 @@ for call, *given in (
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stderr == ""
     lines = done.stdout.splitlines()
-    assert len(lines) == 187
+    assert len(lines) == 189
     assert lines[0].startswith("jaxcal.calibrate takes a problem, not a path: ")
     assert lines[3].startswith("jaxcal.calibrate_batch takes a problem or a recording, not int: ")
     assert lines[4] == "points must have shape (..., 2), not (1, 3)"

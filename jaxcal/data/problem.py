@@ -241,7 +241,8 @@ def _floating(dtype: DTypeLike | None) -> np.dtype:
         found = np.dtype(np.float64 if dtype is None else dtype)
     except TypeError:
         found = np.dtype(object)
-    if found.kind not in "fV":  # bfloat16 and its like are of numpy's kind V
+    # bfloat16 and its like are of numpy's kind V; JAX has nothing longer than 64 bits.
+    if found.kind not in "fV" or found.itemsize > 8:
         raise InputError(f"dtype must be a floating one, e.g. numpy.float32, not {shown(dtype)}")
     return found
 

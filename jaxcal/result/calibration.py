@@ -337,11 +337,16 @@ class Calibration:
 
         None where nothing seems wrong; see :mod:`jaxcal.diagnostics.frame_checks`. If there is
         a text, do not use the answer, however small its residuals and standard deviations are.
+
+        Raises:
+            CalibrationError: under a JAX transformation.
+            InputError: of a batch.
         """
         from jaxcal.diagnostics.frame_checks import wrong_frames
 
-        self._concrete(self.mask)
-        if self.problem is None or self.problem.batch_shape:
+        if self._concrete(self.mask).ndim != 1:
+            raise InputError("a batch holds many calibrations: take one of them, batch[0]")
+        if self.problem is None:
             return None
         return wrong_frames(replace(self.problem, mask=self.mask), self.blocks)
 
