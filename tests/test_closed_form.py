@@ -343,8 +343,9 @@ def test_what_cannot_be_asked_for():
     points = drawn(0, 6)
     with pytest.raises(jaxcal.InputError, match="no closed form for estimate"):
         jaxcal.calibrate_closed_form(points, estimate=("delay",))
-    with pytest.raises(jaxcal.InputError, match="no pixel scale"):
-        jaxcal.calibrate_closed_form(points, estimate=SCALE)
+    for scale in (SCALE, "scale"):
+        with pytest.raises(jaxcal.InputError, match="no pixel scale"):
+            jaxcal.calibrate_closed_form(points, estimate=scale)
     pixels = jaxcal.make_images(points.poses, points.measurements, "pixel")
     with pytest.raises(jaxcal.InputError, match="no spacing_mm"):
         jaxcal.calibrate_closed_form(pixels)

@@ -63,10 +63,8 @@ def test_the_robust_answer_names_them_too(recording):
 def test_three_sizes_of_error_predict_better_than_one(recording):
     """Leave-one-out log density, more than two of its standard errors above one size's."""
     scale: dict[str, Any] = {"estimate": ("scale",)}
-    # Of the calibration of all images nothing is looked at but which of them are used.
-    whole = jaxcal.calibrate(recording, method="conventional", **scale)
-    joint = jaxcal.cross_validate(recording, prior="gaussian", result=whole, **scale)
-    equal = jaxcal.cross_validate(recording, method="conventional", result=whole, **scale)
+    joint = jaxcal.cross_validate(recording, prior="gaussian", **scale)
+    equal = jaxcal.cross_validate(recording, method="conventional", **scale)
     variance = np.asarray(equal.fold_cost)[:, None] / (3 * 53 - 11)
     squared = np.asarray(equal.residual) ** 2 / variance
     one_size = -0.5 * (squared + np.log(2 * np.pi * variance)).sum(axis=1)

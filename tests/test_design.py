@@ -235,6 +235,7 @@ for call, said in (
     (lambda: design.plan(candidates, 12, cost_s="x"), "cost_s must be an array"),
     (lambda: design.least_error(candidates, 12.5), "the number of poses must be a whole number"),
     (lambda: design.simulate_errors(plan, trials="9"), "trials must be a whole number"),
+    (lambda: design.simulate_errors(plan, "flat"), "law must be one of uniform"),
     (lambda: design.images_to(plan, "0.2"), "the wanted error must be a positive number"),
     (lambda: design.make_candidates("linear"), "probe must be a jaxcal.LinearProbe"),
     (lambda: design.make_candidates(region="x"), "region must be made by jaxcal.design.Region"),

@@ -140,6 +140,8 @@ def test_a_batch_of_rows_without_the_last_one():
     np.testing.assert_array_equal(found.status, ["converged", "converged"])
     with pytest.raises(jaxcal.InputError, match="a batch holds many"):
         _ = found.warnings
+    with pytest.raises(jaxcal.InputError, match="a batch holds many"):
+        _ = found.wrong_frames
 
 
 def test_bad_input_is_named():

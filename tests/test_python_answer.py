@@ -65,6 +65,11 @@ def test_batches_and_traces_print_without_a_verdict(recording):
     assert seen[0].startswith("Calibration(")
 
 
+def test_intervals_are_refused_in_words_where_they_are_traced(result):
+    with pytest.raises(jaxcal.CalibrationError, match="not available under jit"):
+        jax.jit(jaxcal.transform_intervals)(result)
+
+
 def test_saved_and_loaded(result, tmp_path):
     result.save(tmp_path / "cal.json")
     loaded = load_calibration(tmp_path / "cal.json")

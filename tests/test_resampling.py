@@ -66,6 +66,15 @@ def test_a_bad_image_has_the_most_influence(data):
     assert float(found.influence[4]) > 3 * float(np.median(found.influence))
 
 
+def test_a_calibration_by_another_method_is_refused(data, whole):
+    """Compared with the folds, it would be taken for the influence of the images."""
+    other = replace(whole, method="alternating", prior="bounded")
+    with pytest.raises(jaxcal.InputError, match=r"has method 'alternating'.* for 'conventional'"):
+        cross_validate(data, folds=4, result=other, **CONVENTIONAL)
+    with pytest.raises(jaxcal.InputError, match=r"has method 'alternating'.* for 'conventional'"):
+        bootstrap(data, 4, result=other, **CONVENTIONAL)
+
+
 @pytest.mark.slow
 def test_folds_and_masked_images(data):
     masked = replace(data, mask=data.mask.at[3].set(0.0))

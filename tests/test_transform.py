@@ -222,16 +222,21 @@ def test_ros_says_what_a_rigid_transform_cannot_hold(tmp_path, capsys):
     known = replace(random_transform(), range_factor=0.9991)
     known.save(tmp_path / "cal.json")
     assert main(["export", str(tmp_path / "cal.json"), str(tmp_path / "a.yaml"), "--ros"]) == 0
-    note = "multiply ranges by 0.9991 (the estimated sound speed), then add 0.0015 m"
+    lateral, axial = known.scale_mm_per_px / 1e3
+    note = (
+        f"multiply u by {lateral:.9g} m and v by {axial:.9g} m (a pixel's size), then multiply "
+        "ranges by 0.9991 (the estimated sound speed), then add 0.0015 m"
+    )
     assert f"- not in this rigid transform: {note}" in capsys.readouterr().out
     assert f"# not in this rigid transform: {note}" in (tmp_path / "a.yaml").read_text()
-    # With that, and the pixel size, both agree.
+    # With that both agree.
     pixel = np.array([300.0, 400.0])
     lateral, deep = known.scale_mm_per_px * pixel
     rigid = read_ros_yaml(tmp_path / "a.yaml")
     found = rigid @ [lateral, 0.0, 0.9991 * deep + 1.5, 1.0]
     np.testing.assert_allclose(found[:3], known.apply(pixel).points[0], atol=1e-9)
-    assert "not in" not in random_transform(offset=0.0).text("ros")
+    points = replace(random_transform(offset=0.0), scale_mm_per_px=None)
+    assert "not in" not in points.text("ros")
 
 
 def test_tus_rec_counts_from_one(tmp_path):

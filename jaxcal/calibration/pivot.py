@@ -114,7 +114,13 @@ class Pivot(eqx.Module):
 
     @property
     def wrong_frames(self) -> str | None:
-        """That no tip stays in place under these poses, in words, or None (concrete)."""
+        """That no tip stays in place under these poses, in words, or None (one, concrete).
+
+        Raises:
+            InputError: of a batch.
+        """
+        if np.ndim(self.status_code):
+            raise InputError("a batch holds many calibrations: look at each one's rms")
         if self.status == "failed" or not float(self.rms) > _LARGEST_RMS_MM:
             return None
         return (

@@ -34,6 +34,7 @@ from jaxcal.result.calibration import Calibration
 from jaxcal.runtime import buckets
 from jaxcal.runtime.arrays import is_traced
 from jaxcal.runtime.given_values import LARGEST_SEED, check_key, check_made, whole_number
+from jaxcal.runtime.messages import shown
 from jaxcal.runtime.precision import in_own_modes
 from jaxcal.solvers import dense
 from jaxcal.solvers.methods import nominal_sound_speed
@@ -116,13 +117,14 @@ def cross_validate(
     Args:
         problem: one problem or a recording.
         folds: image i belongs to fold i mod folds; by default every image is a fold of its own.
-        result: the calibration of all images, if it exists already. Images that it left out as
-            outliers are neither used nor held out.
+        result: the calibration of all images, if it exists already: by the same method, with the
+            same prior, data and unknowns. Images that it left out as outliers are neither used nor
+            held out.
         arguments: as for :func:`jaxcal.calibrate`.
 
     Raises:
-        InputError: too few images, folds that are not from 2 to the number of images, or options
-            that contradict each other.
+        InputError: too few images, folds that are not from 2 to the number of images, options that
+            contradict each other, or a result by another method than they ask for.
     """
     problem = _one_problem(problem, arguments, "jaxcal.cross_validate")
     count = problem.images
@@ -135,6 +137,7 @@ def cross_validate(
     # Outliers were found with all images, so no fold looks for them again.
     options: dict[str, Any] = {**arguments, "robust": False}
     fits = calibrate_batch(_many(problem, problem.mask * rest), **options)
+    _check_alike(result, fits)
     return _compared(problem, result, fits, fold)
 
 
@@ -191,12 +194,13 @@ def bootstrap(
         problem: one problem or a recording.
         resamples: how many draws.
         key: of the draws, or a seed; draw k is fold_in(key, k).
-        result: the calibration of all images, if it exists already. Images that it left out as
-            outliers are not drawn.
+        result: the calibration of all images, if it exists already: by the same method, with the
+            same prior, data and unknowns. Images that it left out as outliers are not drawn.
         arguments: as for :func:`jaxcal.calibrate`.
 
     Raises:
-        InputError: fewer than 2 resamples, or options that contradict each other.
+        InputError: fewer than 2 resamples, options that contradict each other, or a result by
+            another method than they ask for.
     """
     problem = _one_problem(problem, arguments, "jaxcal.bootstrap")
     resamples = whole_number("resamples", resamples, 2, LARGEST_RESAMPLES)
@@ -212,6 +216,7 @@ def bootstrap(
     # Each draw has as many images as were used, since the mask leaves out the other rows.
     options: dict[str, Any] = {**arguments, "robust": False}
     fits = calibrate_batch(_drawn(problem, rows, mask), **options)
+    _check_alike(result, fits)
     return _scatter(problem, result, fits)
 
 
@@ -305,6 +310,17 @@ def _of_all_images(
             f"{np.shape(result.mask)}"
         )
     return result
+
+
+def _check_alike(result: Calibration, fits: Calibration) -> None:
+    """Refuse the caller's calibration where it was made in another way than the fits."""
+    for name in ("method", "prior", "data", "blocks"):
+        given, own = getattr(result, name), getattr(fits, name)
+        if given != own:
+            raise InputError(
+                f"result has {name} {shown(given)}, and the arguments ask for {shown(own)}: give "
+                "those that the result was made with, or no result"
+            )
 
 
 def _one_problem(problem: Problem | Recording, arguments: dict[str, Any], name: str) -> Problem:

@@ -96,7 +96,7 @@ def simulate_errors(
     from jaxcal.calibration.calibrate import calibrate_batch
     from jaxcal.study.laws import check_law
 
-    check_law(law)
+    check_law(law, "law")
     if isinstance(poses, Plan):
         candidates = poses.candidates if candidates is None else candidates
         poses = _with_taken(poses)

@@ -119,16 +119,19 @@ def transform_intervals(
 
     Raises:
         InputError: a level that is not between 0 and 1.
+        CalibrationError: under a JAX transformation.
     """
     if not (is_number(level) and 0 < level < 1):
         raise InputError(f"level must be between 0 and 1, not {level!r}")
-    left = np.asarray(degrees_of_freedom(calibration), float)
+    _check(calibration)
+    answer = calibration.numpy()
+    left = np.asarray(degrees_of_freedom(answer), float)
     factor = np.where(
         np.isfinite(left),
         special.stdtrit(np.where(np.isfinite(left), left, 1.0), 0.5 + 0.5 * level),
         special.ndtri(0.5 + 0.5 * level),
     )
-    variance = np.diagonal(calibration.numpy().covariance, axis1=-2, axis2=-1)
+    variance = np.diagonal(answer.covariance, axis1=-2, axis2=-1)
     return factor[..., None] * np.sqrt(variance)
 
 

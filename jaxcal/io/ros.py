@@ -62,12 +62,20 @@ def static_transform_command(
     )
 
 
-def range_note(range_factor: float, face_offset_mm: float) -> str | None:
+def range_note(
+    range_factor: float, face_offset_mm: float, scale_mm_per_px: Float[np.ndarray, 2] | None = None
+) -> str | None:
     """What a rigid transform leaves to its user, in words; None where z is the measured range.
 
-    ``range_factor`` is the estimated sound speed over the nominal one.
+    Args:
+        range_factor: the estimated sound speed over the nominal one.
+        face_offset_mm: range of pixel row 0, mm.
+        scale_mm_per_px: [lateral, axial] of a pixel; None for points in mm.
     """
     steps = []
+    if scale_mm_per_px is not None:
+        lateral, axial = scale_mm_per_px / 1e3
+        steps.append(f"multiply u by {lateral:.9g} m and v by {axial:.9g} m (a pixel's size)")
     if range_factor != 1:
         steps.append(f"multiply ranges by {range_factor:.9g} (the estimated sound speed)")
     if face_offset_mm != 0:

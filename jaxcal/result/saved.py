@@ -185,7 +185,7 @@ def left_out(transform: ImageTransform, format: SaveFormat) -> str | None:
         return None
     from jaxcal.io.ros import range_note
 
-    return range_note(transform.range_factor, transform.face_offset_mm)
+    return range_note(transform.range_factor, transform.face_offset_mm, transform.scale_mm_per_px)
 
 
 def _record(transform: ImageTransform) -> dict[str, Any]:

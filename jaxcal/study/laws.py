@@ -27,9 +27,7 @@ OffsetLaw = Literal[
 OFFSET_LAWS: tuple[OffsetLaw, ...] = get_args(OffsetLaw)
 
 
-def check_law(law: object) -> None:
-    """Raise InputError for something that is no law's name."""
+def check_law(law: object, name: str = "elevation_distribution") -> None:
+    """Raise InputError, which names the argument, for something that is no law's name."""
     if law not in OFFSET_LAWS:
-        raise InputError(
-            f"elevation_distribution must be one of {', '.join(OFFSET_LAWS)}, not {shown(law)}"
-        )
+        raise InputError(f"{name} must be one of {', '.join(OFFSET_LAWS)}, not {shown(law)}")

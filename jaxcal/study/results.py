@@ -22,7 +22,7 @@ MISSING = -1
 
 
 def open_results(folder: str | os.PathLike[str], *, incomplete: bool = False) -> xarray.Dataset:
-    """Read a study.
+    """Read a study that a TOML file described (:class:`jaxcal.study.Spec`).
 
     Args:
         folder: of the study.
@@ -38,7 +38,7 @@ def open_results(folder: str | os.PathLike[str], *, incomplete: bool = False) ->
 
     Raises:
         MissingExtraError: xarray is not installed.
-        FormatError: no study, a damaged file, or (unless allowed) a missing one.
+        FormatError: no such study, a damaged file, or (unless allowed) a missing one.
     """
     try:
         import xarray

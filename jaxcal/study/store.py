@@ -244,7 +244,7 @@ def read_spec(folder: str | os.PathLike[str], kind: type[Any] = Spec) -> Any:
         kind: its class.
 
     Raises:
-        FormatError: there is none, or it is damaged.
+        FormatError: there is none, it is damaged, or of another class.
     """
     path = Path(path_name(folder)) / "spec.json"
     if not os.path.isdir(folder):
@@ -255,7 +255,10 @@ def read_spec(folder: str | os.PathLike[str], kind: type[Any] = Spec) -> Any:
     try:
         return kind.from_canonical(path.read_text(encoding="utf-8").strip())
     except (InputError, UnicodeDecodeError):
-        raise FormatError(f"{path}: is damaged, or of another version of jaxcal") from None
+        raise FormatError(
+            f"{path}: is no {kind.__name__}: damaged, of another version of jaxcal, or a study of "
+            "another class"
+        ) from None
 
 
 def _pack(

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def calibrate_closed_form(
-    problem: Problem | Recording | Images, *, estimate: tuple[str, ...] = ()
+    problem: Problem | Recording | Images, *, estimate: str | tuple[str, ...] = ()
 ) -> ClosedForm:
     """Conventional calibration (Eq. 7) in closed form, with a certificate.
 
@@ -27,7 +27,8 @@ def calibrate_closed_form(
         problem: a problem or a batch of them, a recording, or one set of images; covariances and
             bounds are not used, since Eq. 7 weighs all images equally.
         estimate: what is unknown beside X and the target: ``()``, ``("scale",)`` (both pixel
-            scales), ``("common-scale",)`` (square pixels of unknown size) or ``("sound-speed",)``.
+            scales), ``("common-scale",)`` (square pixels of unknown size) or
+            ``("sound-speed",)``; one name may stand without its tuple.
 
     Returns:
         The best answer found. Where ``certified`` is False it may not be the best there is; where
@@ -36,6 +37,8 @@ def calibrate_closed_form(
     Raises:
         InputError: other names in ``estimate``, data that cannot be used, fewer than 4 images.
     """
+    if isinstance(estimate, str):
+        estimate = (estimate,)
     if np.ndim(getattr(problem, "mask", ())) > 1 or is_traced(problem):
         from jaxcal.solvers.closed_form.batch import solve_batch
 
