@@ -400,10 +400,14 @@ def test_a_slip_of_the_mount_is_no_stream_and_lowers_the_verdict(shift_mm):
     slipped = jaxcal.make_images(images.poses, points)
     result = jaxcal.calibrate(jaxcal.Recording(slipped), prior="gaussian")
     assert int(result.images_used) == 24
-    told = result.record()["tre"]["contradictions"]
+    tre = result.record()["tre"]
+    told = tre["contradictions"]
     moved = [words for words in told if "the points move sideways by" in words]
     assert len(moved) == (shift_mm > 0)
     assert (result.record()["verdict"] == "uncertain") == (shift_mm > 0)
+    # The map has the verdict's error, not the smaller one that the covariance states.
+    drawn = result.plot_tre().axes[0].collections[0].get_array()
+    assert np.max(drawn) == pytest.approx(max(point["tre_mm"] for point in tre["points"]))
 
 
 def test_pixels_of_an_unusual_size_are_named():
