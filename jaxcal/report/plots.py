@@ -24,6 +24,7 @@ from jaxcal.model.image_points import mean_of_squares
 from jaxcal.report.accuracy import error_shares, region_of, scatter_shares
 from jaxcal.report.convergence import Curve
 from jaxcal.report.summary import recording_of
+from jaxcal.report.svg import bar_length
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.arrays import real_array
@@ -81,7 +82,7 @@ def plot_tre(calibration: Calibration, factor: float = 1.0, points: int = 61) ->
     lines = axes.contour(
         cells[..., 0], cells[..., 1], error, colors="white", linewidths=0.5, levels=5
     )
-    axes.clabel(lines, fontsize=6, fmt="%.2f")
+    axes.clabel(lines, fontsize=6, fmt="%.3g")
     poses = recording.calibration.poses[np.asarray(answer.mask) > 0]
     seen = targets_in_images(poses, answer.image_to_probe, answer.point)
     axes.plot(seen[:, 0], seen[:, 2], "o", ms=1.8, mfc="white", mec="black", mew=0.4)
@@ -92,7 +93,7 @@ def plot_tre(calibration: Calibration, factor: float = 1.0, points: int = 61) ->
     bar.set_label("target registration error (mm)", size=8)
     bar.ax.tick_params(labelsize=7, width=0.6)
     bar.outline.set_linewidth(0.6)  # pyright: ignore[reportCallIssue]
-    _scale_bar(axes, 10.0)
+    _scale_bar(axes, bar_length(float(np.ptp(cells[..., 0]))))
     return figure
 
 

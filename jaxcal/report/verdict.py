@@ -147,7 +147,7 @@ def limits(record: dict[str, Any]) -> list[str]:
             if (influence["moved_mm"][image] or 0.0) > _MOST_MOVED_SHARE * (tre["stated_mm"] or 0.0)
         ]
         if strong:
-            told = ", ".join(f"{image} ({moved:.2f} mm)" for image, moved in strong[:3])
+            told = ", ".join(f"{image} ({_mm(moved)})" for image, moved in strong[:3])
             lines.append(f"Images that move it most when they are left out: {told}.")
     return lines
 
@@ -254,7 +254,7 @@ def certainty(record: dict[str, Any]) -> list[str]:
     along = max(range(3), key=lambda axis: record["covariance"][axis][axis])
     about = max(range(3), key=lambda axis: record["covariance"][3 + axis][3 + axis])
     lines = [
-        f"The image's position on the probe is known to {spread[0]:.2f} mm, worst along its "
+        f"The image's position on the probe is known to {_mm(spread[0])}, worst along its "
         f"{_AXES[along]} axis; its orientation to {spread[1]:.2f} degrees, worst about its "
         f"{_AXES[about]} axis (one standard deviation)."
     ]
