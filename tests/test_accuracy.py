@@ -28,6 +28,7 @@ from jaxcal.diagnostics.intervals import (
 )
 from jaxcal.model.image_points import point_jacobian
 from jaxcal.report.accuracy import FAIR_MM, GOOD_MM, settle
+from jaxcal.report.next_poses import next_poses_sentences
 from jaxcal.report.record import calibration_record
 from jaxcal.report.tables import calibration_table
 from jaxcal.report.verdict import headline, limits, verdict
@@ -373,6 +374,15 @@ def test_verdict_falls_when_the_covariance_is_contradicted(record, kind):
     lines = verdict(changed)
     assert f"{tre['rms_mm']:.2f} mm" in lines[0]
     assert "The noise model by itself states 0.40 mm, but " in lines[1]
+    # Neither poses nor a number of images are promised to remove what contradicts the model.
+    changed["rms_mm"] = 0.45
+    said = " ".join(verdict(changed))
+    assert "what is missing are other poses" not in said
+    assert said.index("First of all what contradicts") < said.index("make its mean square error")
+    changed["next_poses"] = {
+        "tre_now_mm": 0.4, "tre_then_mm": 0.3, "poses": [{"words": "tilt"}], "images_to_half": 5,
+    }  # fmt: skip
+    assert "may stay" in next_poses_sentences(changed)[-1]
     # Said once, whatever is found out later.
     again = copy.deepcopy(changed)
     settle(again)
@@ -400,10 +410,14 @@ def test_a_slip_of_the_mount_is_no_stream_and_lowers_the_verdict(shift_mm):
     slipped = jaxcal.make_images(images.poses, points)
     result = jaxcal.calibrate(jaxcal.Recording(slipped), prior="gaussian")
     assert int(result.images_used) == 24
-    told = result.record()["tre"]["contradictions"]
+    tre = result.record()["tre"]
+    told = tre["contradictions"]
     moved = [words for words in told if "the points move sideways by" in words]
     assert len(moved) == (shift_mm > 0)
     assert (result.record()["verdict"] == "uncertain") == (shift_mm > 0)
+    # The map has the verdict's error, not the smaller one that the covariance states.
+    drawn = result.plot_tre().axes[0].collections[0].get_array()
+    assert np.max(drawn) == pytest.approx(max(point["tre_mm"] for point in tre["points"]))
 
 
 def test_pixels_of_an_unusual_size_are_named():

@@ -771,6 +771,18 @@ def test_plan_from_a_recording_says_what_to_add(simulated, capfd, tmp_path):
     assert figure.read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.usefixtures("calibrated")
+def test_plan_from_a_recording_keeps_the_region_that_no_option_changes(simulated):
+    def region(depth=None, lateral=None):
+        chosen = plan._from_recording(str(simulated), None, None, depth, lateral, None, None, 0)
+        return chosen[1].constraints.region
+
+    seen = region()
+    assert seen.depth_mm[1] > 90
+    assert region(lateral=3.0) == replace(seen, lateral_mm=(-3.0, 3.0))
+    assert region(depth=(30.0, 40.0)) == replace(seen, depth_mm=(30.0, 40.0))
+
+
 def test_plan_from_nothing_is_words_and_counts(capfd):
     out = told(capfd, "plan", "--images", 6, "--cone", 20, "--seed", 1)
     assert "tilt 20 degrees" in out

@@ -62,6 +62,7 @@ ANSWERS = {
         "jaxcal.report.verdict",
         "jaxcal.report.write",
     },
+    "jaxcal.calibration.pivot": {"jaxcal.report.pivot"},
     # ImageTransform.save and .text write what load_calibration makes an ImageTransform of.
     "jaxcal.result.transform": {"jaxcal.result.saved"},
     # Any study computes its chunks; the pipeline computes those of a Spec.

@@ -116,6 +116,17 @@ def test_numbers_are_those_of_the_record(tags, record):
     assert json.loads(tags.inside["record"]) == record
 
 
+def test_small_errors_are_not_zero_and_estimates_are_told(record, result, recording):
+    tre = {**record["tre"], "rms_mm": 0.0039, "interval_95_mm": [0.0014, 0.0074]}
+    found = {"sound_speed_m_s": 1490.43, "sound_speed_sd_m_s": 0.86,
+             "delay_s": -2.14e-8, "delay_sd_s": None}  # fmt: skip
+    text = page({**record, **found, "tre": tre}, result, recording)
+    assert ">0.0039</span>" in text
+    assert ">0.0014</span>" in text
+    assert "1490.4 ± 0.9<" in text
+    assert "-0.021 ± -<" in text
+
+
 def test_matrix_to_copy_is_the_one_that_is_exported(tags, result, tmp_path):
     (tmp_path / "cal.json").write_text(tags.inside["form-json"])
     loaded = load_calibration(tmp_path / "cal.json")
@@ -185,6 +196,20 @@ def test_axes_of_images_tell_a_scale_and_only_images_that_exist(largest):
     along = re.findall(r'text-anchor="middle" class="tick">([^<]*)<', drawn)
     assert len(down) >= 2
     assert along == ["0", "1", "2", "3"]
+
+
+@pytest.mark.parametrize(("wide", "deep"), [(50.0, 7.0), (1000.0, 1300.0), (8.0, 9.0)])
+def test_error_map_of_any_size_tells_its_scales(wide, deep):
+    lateral, axial = np.meshgrid(np.linspace(0, wide, 5), np.linspace(0, deep, 5))
+    drawn = svg.error_map(lateral, axial, 0.1 + 0.2 * axial / deep, np.zeros((0, 2)), "map")
+    height = float(re.findall(r'viewBox="0 0 380 ([0-9.]+)"', drawn)[0])
+    found = re.findall(r'y="([0-9.]+)" text-anchor="start" class="tick">([0-9.]+)<', drawn)
+    places = np.array([float(y) for y, _ in found])
+    assert len(places) >= 2
+    assert (np.abs(np.diff(places)) > 10).all()
+    assert (places < height).all()
+    for length in map(float, re.findall(r">([0-9.]+) mm</text>", drawn)):
+        assert wide / 12 < length <= wide / 4
 
 
 @pytest.mark.parametrize(("low", "high"), [(0.2, 0.58), (-3.1, 2.2), (0.0, 1e-4), (-71.0, 88.0)])

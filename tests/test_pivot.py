@@ -91,7 +91,13 @@ def test_poses_that_a_tracker_repeats_count_once(tmp_path, capsys):
     path = tmp_path / "poses.txt"
     np.savetxt(path, np.repeat(poses, 2, axis=0).reshape(120, 16))
     assert main(["pivot", str(path)]) == 0
-    assert "60 poses repeat an earlier one exactly and are not used" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "60 poses repeat an earlier one exactly and are not used" in said
+    assert str(twice).split() == said.split()
+    assert twice.record()["repeated"] == 60
+    np.testing.assert_allclose(twice.record()["tip_mm"], TIP, atol=0.5)
+    with_hidden = np.ma.masked_array(np.ones(60), np.arange(60) >= 50)
+    assert int(jaxcal.calibrate_pivot(poses, with_hidden).mask.sum()) == 50
     np.testing.assert_allclose(twice.covariance, once.covariance, rtol=1e-9)
     with pytest.raises(InputError, match="20 used poses, 2 of them different, are too few"):
         jaxcal.calibrate_pivot(np.repeat(poses[:2], 10, axis=0))

@@ -19,7 +19,6 @@ import os
 import time
 from collections import deque
 from dataclasses import asdict, dataclass
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -27,7 +26,7 @@ import numpy as np
 from hw.active_echo.device import ActiveEcho, EchoFrame
 from hw.freehand.guide import mean_pose, spread_of
 from hw.freehand.kept import KeptImages, read_images
-from hw.freehand.posed import PosedImage, PosedImages
+from hw.freehand.posed import PosedImage, PosedImages, pose_at_arrival
 from hw.freehand.request import FreeHand, FreeHandStopped, Person, recorded_request
 from hw.midplane.amplitude_scan import fit_peak
 from hw.midplane.bracket import Bracket
@@ -45,7 +44,6 @@ from hw.ultrasound.receiver import UltrasoundStream
 from jaxcal import CalibrationError, InputError
 from jaxcal.data.poses import inverse_poses
 from jaxcal.data.recording import MINIMUM_IMAGES, MetresError, check_pose_units
-from jaxcal.data.timing import interpolate_poses
 from jaxcal.io.readable import naming
 from jaxcal.runtime.array_types import Float
 
@@ -53,8 +51,6 @@ _KIND = "pattern-injection"
 _SILENCE_S = 3.0
 _DELAY_TICKS = 400
 _PATTERN_PERIOD_S = 0.1
-_LONGEST_GAP_S = 0.3
-"""Longest time between two images with poses over which the pose is interpolated."""
 _ANOTHER_DEG = 5.0
 """When the hand has turned the probe by more than this, a new sweep begins."""
 _FASTEST_MM_S = 6.0
@@ -258,33 +254,13 @@ class _Run:
         self._waiting += [frame for frame in frames if not frame.late_s > _LATEST_S]
         later = []
         for frame in self._waiting:
-            pose = self._pose_at(frame.t_host)
+            pose = pose_at_arrival(self._images, frame.t_host)
             if isinstance(pose, bool):
                 later += [frame] if pose else []
             elif not self._too_fast():
                 self._sample(frame, pose)
         self._waiting = later[-256:]
         self._inject(now)
-
-    def _pose_at(self, t: float) -> np.ndarray | bool:
-        """The pose at a time of arrival; True if it may still come, False if there is none.
-
-        Images and poses that a slow link holds up count as of when they would have come otherwise.
-        """
-        images = list(self._images)
-        if not images or t > images[-1].image.prompt_s:
-            return True
-        for before, after in pairwise(images):
-            times = np.array([before.image.prompt_s, after.image.prompt_s])
-            if not times[0] <= t <= times[1]:
-                continue
-            if before.pose is None or after.pose is None or np.diff(times)[0] > _LONGEST_GAP_S:
-                return False
-            if times[1] <= times[0]:
-                return after.pose
-            both = np.stack([before.pose, after.pose])
-            return interpolate_poses(times, both, np.array([t]), max_gap_s=_LONGEST_GAP_S)[0]
-        return False
 
     def _too_fast(self) -> bool:
         """Whether the hand is so fast that the times do not say well enough where it was."""

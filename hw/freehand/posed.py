@@ -11,7 +11,9 @@ from __future__ import annotations
 
 import time
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -27,6 +29,9 @@ LISTEN_S = 5.0
 _MORE_S = 0.5
 """How long to listen after both have come, so that all names are known."""
 _LONGEST_GAP_S = 0.2
+"""Longest time between two transforms over which they are interpolated."""
+_LONGEST_IMAGE_GAP_S = 0.3
+"""The same between two images with poses."""
 _LATEST_S = 0.4
 """How long an image waits for the pose after it, beyond a negative lag."""
 _SAME_S = 1e-6
@@ -218,6 +223,34 @@ class PosedImages:
                 )[0]
             before = sample
         return f"{name} began after this image"
+
+
+def pose_at_arrival(images: Iterable[PosedImage], t: float) -> Float[np.ndarray, "4 4"] | bool:
+    """Where the probe was when something else arrived.
+
+    Args:
+        images: one after the other. Those that a slow link holds up count as of when they would
+            have come otherwise.
+        t: time of arrival, bench s.
+
+    Returns:
+        The pose; True if it may still come, False if there is none.
+    """
+    known = list(images)
+    if not known or t > known[-1].image.prompt_s:
+        return True
+    for before, after in pairwise(known):
+        times = np.array([before.image.prompt_s, after.image.prompt_s])
+        if not times[0] <= t <= times[1]:
+            continue
+        gap = _LONGEST_IMAGE_GAP_S
+        if before.pose is None or after.pose is None or np.diff(times)[0] > gap:
+            return False
+        if times[1] <= times[0]:
+            return after.pose
+        both = np.stack([before.pose, after.pose])
+        return interpolate_poses(times, both, np.array([t]), max_gap_s=gap)[0]
+    return False
 
 
 def _chosen(pairs: dict[str, FramePair], source: str | None, target: str | None) -> FramePair:

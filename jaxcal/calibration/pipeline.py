@@ -46,6 +46,7 @@ def solve_problems(
     """
     if not plan.options.differentiate:
         problems, given = jax.lax.stop_gradient((problems, given))
+    is_mask = (problems.mask == 0) | (problems.mask == 1)
     problems = problems.cleared(problems.mask)
     if plan.robust:
         if agreed is None:
@@ -53,6 +54,8 @@ def solve_problems(
             seen = jax.lax.stop_gradient(problems.points_only())
             agreed = jax.vmap(_one_at_a_time(plan.blocks))(seen)
         problems = replace(problems, mask=agreed)
+    # What is neither used nor left out must not count as something between: its problem fails.
+    problems = replace(problems, mask=jnp.where(is_mask, problems.mask, jnp.nan))
     if plan.one_by_one:
         solution = jax.lax.map(
             lambda problem: _solved(*_alone(problem, plan), given, plan), problems

@@ -11,6 +11,7 @@ The errors of the three axes share one SD, so this is plain least squares on the
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -164,6 +165,24 @@ class Pivot(eqx.Module):
             found.append(f"{verb} {len(named)} poses that do not fit the rest: {told}")
         return found
 
+    def record(self) -> dict[str, Any]:
+        """What ``jaxcal pivot --json`` prints, as plain values (one calibration, concrete).
+
+        Raises:
+            InputError: of a batch.
+        """
+        from jaxcal.report.pivot import pivot_record
+
+        return pivot_record(self)
+
+    def __str__(self) -> str:
+        """Tip, pivot point and their errors; of a batch or traced, the shapes of the arrays."""
+        if is_traced(self) or np.ndim(self.status_code):
+            return repr(self)
+        from jaxcal.report.pivot import pivot_lines
+
+        return "\n".join(pivot_lines(self.record()))
+
 
 @in_own_modes
 def calibrate_pivot(
@@ -193,6 +212,8 @@ def calibrate_pivot(
     shape = np.shape(poses)
     if len(shape) < 3 or shape[-2:] not in ((4, 4), (3, 4)):
         raise InputError(f"poses must have shape (n, 4, 4), not {shape}")
+    if isinstance(mask, np.ma.MaskedArray):
+        mask = mask.filled(0)  # a masked entry is left out
     if mask is not None and np.shape(mask) not in (shape[:-2], shape[-3:-2]):
         raise InputError(f"mask must have shape {shape[:-2]}, not {np.shape(mask)}")
     if not (mask is None or is_traced(mask) or np.asarray(mask).dtype == bool):

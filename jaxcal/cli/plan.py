@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import click
@@ -57,9 +57,8 @@ _PICTURES = (b"\x89PNG", b"\xff\xd8\xff", b"%PDF", b"%!PS", b"<?xml", b"RIFF", b
 @click.option(
     "--probe",
     type=click.Choice(["linear", "curvilinear"]),
-    default="linear",
-    show_default=True,
-    help="Transducer where the recording names none: L14-5 or C5-2.",
+    help="Transducer where the recording names none: L14-5 or C5-2.  [default: linear; with REC "
+    "where its target was]",
 )
 @click.option(
     "--depth",
@@ -117,7 +116,7 @@ def plan(
     images: int | None,
     until_tre: float | None,
     criterion: Literal["tre", "rp", "d"],
-    probe: str,
+    probe: str | None,
     depth: tuple[float, float] | None,
     lateral: float | None,
     cone: float | None,
@@ -149,12 +148,13 @@ def plan(
     enable_compilation_cache()
     if figure is not None:
         check_output(figure, "a picture", begins_with(*_PICTURES), [recording] if recording else ())
-    region = None if depth is None and lateral is None else _region(probe, depth, lateral)
     result = None
     if recording is None:
-        candidates = _from_nothing(probe, region, cone, turn, sigma, seed)
+        candidates = _from_nothing(probe or "linear", depth, lateral, cone, turn, sigma, seed)
     else:
-        result, candidates = _from_recording(recording, estimate, region, cone, turn, seed)
+        result, candidates = _from_recording(
+            recording, estimate, probe, depth, lateral, cone, turn, seed
+        )
     with progress("planning"):
         count = images or (30 if result is None else 10)
         if until_tre is not None:
@@ -190,17 +190,19 @@ def plan(
     return ExitCode.CONVERGED
 
 
-def _region(probe: str, depth: tuple[float, float] | None, lateral: float | None) -> Region:
-    from jaxcal.data.probe import PRESETS
-    from jaxcal.design import Region
-
-    across = None if lateral is None else (-lateral, lateral)
-    return Region.of_probe(PRESETS[probe], depth or (15.0, 82.0), across)
+def _region(whole: Region, depth: tuple[float, float] | None, lateral: float | None) -> Region:
+    """A region, with the depths and lateral positions that were asked for in the place of its."""
+    return replace(
+        whole,
+        depth_mm=whole.depth_mm if depth is None else depth,
+        lateral_mm=whole.lateral_mm if lateral is None else (-lateral, lateral),
+    )
 
 
 def _from_nothing(
     probe: str,
-    region: Region | None,
+    depth: tuple[float, float] | None,
+    lateral: float | None,
     cone: float | None,
     turn: float | None,
     sigma: tuple[float, float, float] | None,
@@ -210,9 +212,8 @@ def _from_nothing(
     from jaxcal.data.probe import PRESETS
 
     transducer = PRESETS[probe]
-    region = design.Region.of_probe(transducer) if region is None else region
     bounds = design.Constraints(
-        region=region,
+        region=_region(design.Region.of_probe(transducer), depth, lateral),
         cone_deg=40.0 if cone is None else cone,
         turn_deg=90.0 if turn is None else turn,
     )
@@ -225,7 +226,9 @@ def _from_nothing(
 def _from_recording(
     path: str,
     estimate: str | None,
-    region: Region | None,
+    probe: str | None,
+    depth: tuple[float, float] | None,
+    lateral: float | None,
     cone: float | None,
     turn: float | None,
     seed: int,
@@ -233,6 +236,7 @@ def _from_recording(
     from jaxcal import design
     from jaxcal.calibration.calibrate import calibrate
     from jaxcal.calibration.options import unknown_names
+    from jaxcal.data.probe import PRESETS
     from jaxcal.io.hdf5 import load
     from jaxcal.report.next_poses import NOT_PLANNED
 
@@ -249,9 +253,17 @@ def _from_recording(
         raise InputError(f"{path}: the calibration failed: there is nothing to plan from")
     if result.wrong_frames is not None:
         raise InputError(f"{path}: {result.wrong_frames}")
-    candidates = design.candidates_around(
-        measured, result, region=region, cone_deg=cone, turn_deg=turn, seed=seed
-    )
+    if probe is not None and measured.probe is None:
+        measured = replace(measured, probe=PRESETS[probe])
+
+    def around(region: Region | None) -> Candidates:
+        return design.candidates_around(
+            measured, result, region=region, cone_deg=cone, turn_deg=turn, seed=seed
+        )
+
+    candidates = around(None)
+    if depth is not None or lateral is not None:
+        candidates = around(_region(candidates.constraints.region, depth, lateral))
     return result, candidates
 
 

@@ -176,25 +176,37 @@ def _limits(
     answer: Calibration, found: Influence, weight: Float[np.ndarray, "p p"]
 ) -> dict[str, Any]:
     """Shares of the mean square error at the image, and of the scatter of the target."""
-    sigma = np.asarray(answer.sigma, float)
     residual = np.asarray(answer.residual)[np.asarray(answer.mask) > 0]
-    part = np.einsum("pq,kpq->k", weight, found.shares)
-    if not np.isfinite(part).all() or not part.sum() > 0:
-        part = np.full(len(KINDS), np.nan)
-    elif answer.prior in ("none", "bounded"):
-        # These weigh all kinds alike: scale the shares by the kinds' own variances.
-        part = part * sigma**2
     squares = np.mean(residual**2, axis=0)
-    whole = float(squares.sum())
-    scatter = squares[[0, 2, 1]] / whole if whole > 0 else np.full(3, np.nan)
     return {
-        "error_share": dict(zip(KINDS, part / part.sum(), strict=True)),
-        "scatter_share": dict(zip(KINDS, scatter, strict=True)),
+        "error_share": dict(zip(KINDS, error_shares(answer, found, weight), strict=True)),
+        "scatter_share": dict(zip(KINDS, scatter_shares(answer), strict=True)),
         "rms_lateral_mm": math.sqrt(squares[0]),
         "rms_axial_mm": math.sqrt(squares[2]),
         "rms_elevational_mm": math.sqrt(squares[1]),
         "rms_in_plane_mm": math.sqrt(squares[0] + squares[2]),
     }
+
+
+def error_shares(
+    answer: Calibration, found: Influence, weight: Float[np.ndarray, "p p"]
+) -> Float[np.ndarray, " kinds"]:
+    """Shares of :data:`KINDS` in the mean square error at the image; NaN if not known."""
+    part = np.einsum("pq,kpq->k", weight, found.shares)
+    if not np.isfinite(part).all() or not part.sum() > 0:
+        return np.full(len(KINDS), np.nan)
+    if answer.prior in ("none", "bounded"):
+        # These weigh all kinds alike: scale the shares by the kinds' own variances.
+        part = part * np.asarray(answer.sigma, float) ** 2
+    return part / part.sum()
+
+
+def scatter_shares(answer: Calibration) -> Float[np.ndarray, " kinds"]:
+    """Shares of :data:`KINDS` in the mean square residual; NaN if there is none."""
+    residual = np.asarray(answer.residual)[np.asarray(answer.mask) > 0]
+    squares = np.mean(residual**2, axis=0)[[0, 2, 1]]
+    whole = float(squares.sum())
+    return squares / whole if whole > 0 else np.full(len(KINDS), np.nan)
 
 
 def _unmodelled(answer: Calibration, grid: Float[np.ndarray, "m 2"]) -> dict[str, Any] | None:

@@ -162,6 +162,14 @@ def _number(record: dict[str, Any], path: str, form: str, unit: str = "") -> str
     return f'<span data-record="{path}" data-form="{form}">{value:{form}}</span>{tail}'
 
 
+def _length(record: dict[str, Any], path: str, unit: str = "") -> str:
+    """A length of the record (mm), with more digits where it is near zero, as in the verdict."""
+    value: Any = record
+    for key in path.split("."):
+        value = value[int(key)] if isinstance(value, list) else value[key]
+    return _number(record, path, ".4f" if value is not None and value < 0.0095 else ".2f", unit)
+
+
 def _paragraphs(lines: list[str]) -> str:
     """Sentences and lists (:mod:`jaxcal.report.paragraphs`)."""
     parts, items = [], []
@@ -201,10 +209,10 @@ def _head(record: dict[str, Any]) -> str:
     number = ""
     if _usable(record) and tre is not None and tre.get("rms_mm") is not None:
         number = (
-            f'<div><span class="big">{_number(record, "tre.rms_mm", ".2f", "mm")}</span>'
+            f'<div><span class="big">{_length(record, "tre.rms_mm", "mm")}</span>'
             "<small>error to expect at the image (TRE, root mean square)<br>95 % interval "
-            f"{_number(record, 'tre.interval_95_mm.0', '.2f')} to "
-            f"{_number(record, 'tre.interval_95_mm.1', '.2f', 'mm')}</small></div>"
+            f"{_length(record, 'tre.interval_95_mm.0')} to "
+            f"{_length(record, 'tre.interval_95_mm.1', 'mm')}</small></div>"
         )
     prior = "" if record["prior"] == "none" else f", prior {record['prior']}"
     said = [headline(record)]
@@ -253,15 +261,15 @@ def _accuracy(record: dict[str, Any], answer: Calibration, recording: Recording)
     rows = []
     for k, point in enumerate(tre["points"]):
         path = f"tre.points.{k}"
-        u, v = (_number(record, f"{path}.image.{axis}", ".1f") for axis in range(2))
-        low, high = (_number(record, f"{path}.interval_95_mm.{end}", ".2f") for end in range(2))
-        error = _number(record, f"{path}.tre_mm", ".2f")
+        u, v = (_number(record, f"{path}.image.{axis}", "z.1f") for axis in range(2))
+        low, high = (_length(record, f"{path}.interval_95_mm.{end}") for end in range(2))
+        error = _length(record, f"{path}.tre_mm")
         rows.append((escape(point["name"]), f"{u}, {v}", error, f"{low} to {high}"))
     head = ("point", f"image ({tre['unit']})", "TRE (mm)", "95 % interval (mm)")
     why = "".join(f"<li>{escape(text)}</li>" for text in tre["contradictions"])
     if why:
         why = (
-            f"<p>The covariance states {_number(record, 'tre.stated_mm', '.2f', 'mm')}; all "
+            f"<p>The covariance states {_length(record, 'tre.stated_mm', 'mm')}; all "
             f"numbers here are {_number(record, 'tre.factor', '.2f')} times as large, since</p>"
             f"<ul>{why}</ul>"
         )
@@ -338,7 +346,7 @@ def _scene(record: dict[str, Any], answer: Calibration, recording: Recording) ->
         "radius": float(np.linalg.norm(far - centre, axis=1).max()),
         "lines": lines,
         "dots": dots,
-        "bar": _bar(float(np.linalg.norm(np.ptp(far, axis=0)))),
+        "bar": svg.bar_length(float(np.linalg.norm(np.ptp(far, axis=0)))),
     }
     views = (
         (
@@ -405,20 +413,13 @@ def _close_up(
         "radius": radius,
         "lines": lines,
         "dots": dots,
-        "bar": _bar(2 * radius),
+        "bar": svg.bar_length(2 * radius),
     }
 
 
 def _rounded(values: Any) -> Any:
     """Numbers (mm) rounded to a hundredth of a micrometre, as plain lists."""
     return np.round(np.asarray(values, float), 5).tolist()
-
-
-def _bar(size: float) -> float:
-    """A round length of about a quarter of a size, mm."""
-    power = 10.0 ** math.floor(math.log10(max(size / 4, 1e-9)))
-    length = max(power * k for k in (1, 2, 5) if power * k <= size / 4 * (1 + 1e-9))
-    return float(f"{length:.3g}")
 
 
 def _residuals(record: dict[str, Any], answer: Calibration) -> str:
@@ -485,7 +486,7 @@ def _limits(record: dict[str, Any]) -> str:
         if all(share is not None for _, share, _ in shares):
             rows.append((title, [(word, float(share), colour) for word, share, colour in shares]))
     sds = " ".join(
-        f"{word} {_number(record, f'sigma_{name}_mm', '.2f', 'mm')}{mark}"
+        f"{word} {_length(record, f'sigma_{name}_mm', 'mm')}{mark}"
         for word, name, mark in (
             ("sideways", "lateral", ","),
             ("depth", "range", ","),
@@ -586,6 +587,14 @@ def _facts(record: dict[str, Any]) -> str:
     scale = record["scale_mm_per_px"]
     if scale is not None:
         rows.append(("pixel size (mm)", f"{scale[0]:.6f} lateral, {scale[1]:.6f} axial"))
+    for name, key, unit, form in (
+        ("sound speed (m/s)", "sound_speed{}_m_s", 1.0, ".1f"),
+        ("delay (us)", "delay{}_s", 1e6, ".3f"),
+    ):
+        value, sd = record[key.format("")], record[key.format("_sd")]
+        if value is not None:
+            spread = "-" if sd is None else format(unit * sd, form)
+            rows.append((name, f"{unit * value:{form}} ± {spread}"))
     return _section(
         "Facts",
         _table([(escape(name), escape(str(value))) for name, value in rows], words=2),

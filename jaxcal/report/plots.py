@@ -21,9 +21,10 @@ from jaxcal.diagnostics.influence import KINDS, in_image, influence_of
 from jaxcal.diagnostics.intervals import image_jacobian, tre_at
 from jaxcal.diagnostics.outliers import outliers
 from jaxcal.model.image_points import mean_of_squares
-from jaxcal.report.accuracy import region_of
+from jaxcal.report.accuracy import error_shares, region_of, scatter_shares
 from jaxcal.report.convergence import Curve
 from jaxcal.report.summary import recording_of
+from jaxcal.report.svg import bar_length
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.arrays import real_array
@@ -54,11 +55,13 @@ def styled(axes: Axes) -> Axes:
     return axes
 
 
-def plot_tre(calibration: Calibration, points: int = 61) -> Figure:
-    """Map over the image of the target registration error that the covariance states, mm.
+def plot_tre(calibration: Calibration, factor: float = 1.0, points: int = 61) -> Figure:
+    """Map over the image of the target registration error to expect, mm.
 
     Args:
         calibration: of one problem, with concrete values.
+        factor: how many times the error that the covariance states is to be expected
+            (``tre.factor`` of the calibration's record).
         points: along each side of the map.
 
     Raises:
@@ -68,8 +71,10 @@ def plot_tre(calibration: Calibration, points: int = 61) -> Figure:
     region = region_of(answer, recording)
     side = np.linspace(-1.0, 1.0, points)
     cells = region.place(np.stack(np.meshgrid(side, side), axis=-1))[..., [0, 2]]
-    error = tre_at(answer, cells).rms
+    error = factor * tre_at(answer, cells).rms
     figure = canvas(COLUMN_MM, COLUMN_MM)
+    # Axes of equal scale shrink after they are laid out, and only this layout sees it.
+    figure.set_layout_engine("compressed")
     axes = styled(figure.subplots())
     drawn = axes.pcolormesh(
         cells[..., 0], cells[..., 1], error, cmap="viridis", shading="gouraud", rasterized=True
@@ -77,7 +82,7 @@ def plot_tre(calibration: Calibration, points: int = 61) -> Figure:
     lines = axes.contour(
         cells[..., 0], cells[..., 1], error, colors="white", linewidths=0.5, levels=5
     )
-    axes.clabel(lines, fontsize=6, fmt="%.2f")
+    axes.clabel(lines, fontsize=6, fmt="%.3g")
     poses = recording.calibration.poses[np.asarray(answer.mask) > 0]
     seen = targets_in_images(poses, answer.image_to_probe, answer.point)
     axes.plot(seen[:, 0], seen[:, 2], "o", ms=1.8, mfc="white", mec="black", mew=0.4)
@@ -88,7 +93,7 @@ def plot_tre(calibration: Calibration, points: int = 61) -> Figure:
     bar.set_label("target registration error (mm)", size=8)
     bar.ax.tick_params(labelsize=7, width=0.6)
     bar.outline.set_linewidth(0.6)  # pyright: ignore[reportCallIssue]
-    _scale_bar(axes, 10.0)
+    _scale_bar(axes, bar_length(float(np.ptp(cells[..., 0]))))
     return figure
 
 
@@ -222,13 +227,11 @@ def plot_limits(calibration: Calibration) -> Figure:
     """
     answer, recording = _determined(calibration, "its error has no shares")
     weight = _weight(answer, recording)
-    part = np.einsum("pq,kpq->k", weight, influence_of(answer).shares)
-    residual = np.asarray(answer.residual)[np.asarray(answer.mask) > 0]
-    squares = np.mean(residual**2, axis=0)[[0, 2, 1]]
+    shares = error_shares(answer, influence_of(answer), weight)
     figure = canvas(PAGE_MM, 38.0)
     panel = styled(figure.subplots())
     rows = ("distance of the target\nfrom its place", "error of the calibration\nat the image")
-    for row, values in enumerate((squares / squares.sum(), part / part.sum())):
+    for row, values in enumerate((scatter_shares(answer), shares)):
         left = 0.0
         for kind, share in zip(KINDS, values, strict=True):
             panel.barh(

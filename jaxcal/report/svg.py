@@ -57,6 +57,13 @@ def ticks(low: Number, high: Number, most: int = 6) -> list[Any]:
     return [k * step for k in range(first, math.floor(high / step + 1e-9) + 1)]
 
 
+def bar_length(size: float) -> float:
+    """A round length for a scale bar, about a quarter of a size (both in mm)."""
+    power = 10.0 ** math.floor(math.log10(max(size / 4, 1e-9)))
+    length = max(power * k for k in (1, 2, 5) if power * k <= size / 4 * (1 + 1e-9))
+    return float(f"{length:.3g}")
+
+
 def number(value: Number) -> str:
     """A tick's label: no more digits than it needs, a true minus sign."""
     return f"{value:.6g}".replace("-", "−")
@@ -288,16 +295,19 @@ def error_map(
         if x[0] <= a <= x[1] and y[0] <= b <= y[1]:
             dot = 'fill="#fff" stroke="#000" stroke-width="0.6"'
             parts.append(circle(*panel.place(float(a), float(b)), 1.7, dot))
-    parts += _colour_bar(48.0 + across + 22.0, 22.0, min(down - 24.0, 150.0), low, high)
-    bar = 10.0 * across / (x[1] - x[0])
+    # Of a shallow image, too, the bar has room for its numbers.
+    tall = min(max(down - 24.0, 46.0), 150.0)
+    parts += _colour_bar(48.0 + across + 22.0, 22.0, tall, low, high)
+    length = bar_length(float(np.ptp(lateral)))
+    bar = length * across / (x[1] - x[0])
     left, under = 48.0 + across + 22.0, 10.0 + down - 4.0
     if down > 210:
         parts.append(line(left, under, left + bar, under, "var(--text)", 2.0))
-        parts.append(text(left, under - 6, "10 mm", "start", "tick"))
+        parts.append(text(left, under - 6, f"{length:g} mm", "start", "tick"))
         dot = 'fill="#fff" stroke="var(--text)" stroke-width="0.6"'
         parts.append(circle(left + 2, under - 30, 1.7, dot))
         parts.append(text(left + 8, under - 27, "target", "start", "tick"))
-    return figure(10.0 + down + 34.0, parts, label)
+    return figure(max(10.0 + down + 34.0, 22.0 + tall + 8.0), parts, label)
 
 
 def _colour_bar(left: Number, top: Number, height: Number, low: Number, high: Number) -> list[str]:
@@ -307,7 +317,11 @@ def _colour_bar(left: Number, top: Number, height: Number, low: Number, high: Nu
         y = top + height * (1 - (k + 1) / steps)
         colour = viridis((k + 0.5) / steps)
         parts.append(rect(left, y, 12, height / steps + 0.4, f'fill="{colour}"'))
-    for value in ticks(low, high, 5):
+    most = 5 if height >= 90 else 3
+    found = ticks(low, high, most)
+    if len(found) < 2:  # a single number tells no scale
+        found = ticks(low, high, most + 2)
+    for value in found:
         y = top + height * (1 - (value - low) / ((high - low) or 1.0))
         parts.append(line(left + 12, y, left + 15, y, "var(--text)", 0.8))
         parts.append(text(left + 18, y + 3.2, number(value), "start", "tick"))

@@ -137,7 +137,7 @@ def _accuracy(record: dict[str, Any]) -> list[tuple[str, str]]:
     facts = [("error to expect at the image (mm)", shown(tre["rms_mm"], tre["interval_95_mm"]))]
     for point in tre["points"]:
         u, v = point["image"]
-        place = f"({u:g}, {v:g})" if point["name"] == "asked for" else f"({u:.0f}, {v:.0f})"
+        place = f"({u:g}, {v:g})" if point["name"] == "asked for" else f"({u:z.0f}, {v:z.0f})"
         named = "" if point["name"] == "asked for" else f"{point['name']} "
         facts.append(
             (f"  at {named}{place} {tre['unit']}", shown(point["tre_mm"], point["interval_95_mm"]))

@@ -126,6 +126,11 @@ def limits(record: dict[str, Any]) -> list[str]:
     if found is None or tre is None:
         return []
     lines = []
+    if tre.get("contradictions"):
+        lines.append(
+            "First of all what contradicts the noise model, as said above; the rest of this list "
+            "is about the error that the noise model states."
+        )
     shares = {kind: share for kind, share in found["error_share"].items() if share is not None}
     if shares:
         ranked = sorted(shares.items(), key=lambda item: -item[1])
@@ -142,7 +147,7 @@ def limits(record: dict[str, Any]) -> list[str]:
             if (influence["moved_mm"][image] or 0.0) > _MOST_MOVED_SHARE * (tre["stated_mm"] or 0.0)
         ]
         if strong:
-            told = ", ".join(f"{image} ({moved:.2f} mm)" for image, moved in strong[:3])
+            told = ", ".join(f"{image} ({_mm(moved)})" for image, moved in strong[:3])
             lines.append(f"Images that move it most when they are left out: {told}.")
     return lines
 
@@ -166,14 +171,19 @@ def scatter(record: dict[str, Any]) -> list[str]:
     )
     ranked = sorted(found["scatter_share"].items(), key=lambda item: -(item[1] or 0.0))
     told = [f"{_KINDS[kind]} {100 * share:.0f} %" for kind, share in ranked if share is not None]
-    smaller = (record["tre"]["rms_mm"] or 0.0) < (record["rms_mm"] or 0.0)
-    means = (
-        "That is how the images were taken and read, which no calibration removes; the "
-        "calibration's own error is the smaller number above."
-        if smaller
-        else "The images agree with each other better than the calibration is known: what is "
-        "missing are other poses."
-    )
+    tre, within = record["tre"], record["rms_mm"] or 0.0
+    if (tre["rms_mm"] or 0.0) < within:
+        means = (
+            "That is how the images were taken and read, which no calibration removes; the "
+            "calibration's own error is the smaller number above."
+        )
+    elif (tre["stated_mm"] or 0.0) < within:
+        means = "The error to expect is larger because of what contradicts the noise model."
+    else:
+        means = (
+            "The images agree with each other better than the calibration is known: what is "
+            "missing are other poses."
+        )
     return [
         f"Seen through it, the target stays within {_mm(record['rms_mm'])} of one place{shown}: "
         f"{', '.join(told)} of the mean square. {means}"
@@ -244,7 +254,7 @@ def certainty(record: dict[str, Any]) -> list[str]:
     along = max(range(3), key=lambda axis: record["covariance"][axis][axis])
     about = max(range(3), key=lambda axis: record["covariance"][3 + axis][3 + axis])
     lines = [
-        f"The image's position on the probe is known to {spread[0]:.2f} mm, worst along its "
+        f"The image's position on the probe is known to {_mm(spread[0])}, worst along its "
         f"{_AXES[along]} axis; its orientation to {spread[1]:.2f} degrees, worst about its "
         f"{_AXES[about]} axis (one standard deviation)."
     ]

@@ -128,7 +128,7 @@ def write_report(
     }
     if record.get("tre") is not None:
         figures |= {
-            "accuracy": plots.plot_tre(result),
+            "accuracy": plots.plot_tre(result, record["tre"].get("factor", 1.0)),
             "influence": plots.plot_influence(result),
             "limits": plots.plot_limits(result),
         }

@@ -481,7 +481,8 @@ class Calibration:
         """Map of the error to expect over the image (matplotlib)."""
         from jaxcal.report import plots
 
-        return plots.plot_tre(self)
+        tre = self.record()["tre"]
+        return plots.plot_tre(self, 1.0 if tre is None else tre.get("factor", 1.0))
 
     def plot_residuals(self) -> Figure:
         """Residual of every image (matplotlib)."""

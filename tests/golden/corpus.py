@@ -60,7 +60,7 @@ TRACKER = Call("tracker", {"sigma": [0.3, 0.15, 1.0], "tracker_sd": 0.2}, BATCH)
 
 def of_scale(call: Call) -> Call:
     """The call with the pixels' size unknown; recorded for batches."""
-    return Call(call.name, call.arguments | {"estimate": ["scale"]}, BATCH)
+    return Call(call.name, call.arguments | {"estimate": ("scale",)}, BATCH)
 
 
 CALLS: dict[str, tuple[Call, ...]] = {
@@ -107,8 +107,8 @@ CALLS: dict[str, tuple[Call, ...]] = {
     "pixels24": tuple(map(of_scale, (CONVENTIONAL, ALTERNATING, AUTO, GAUSSIAN, BOUNDED, GIVEN))),
     "pixels-covariances12": tuple(map(of_scale, (AUTO, GAUSSIAN))),
     "linear12": (
-        Call("auto, speed and delay", {"estimate": ["sound-speed", "delay"]}, BATCH),
-        Call("gaussian, speed", {"prior": "gaussian", "estimate": ["sound-speed"]}, BATCH),
+        Call("auto, speed and delay", {"estimate": ("sound-speed", "delay")}, BATCH),
+        Call("gaussian, speed", {"prior": "gaussian", "estimate": ("sound-speed",)}, BATCH),
         Call("given, channels", {"sigma": [0.3, 1.0], "data": "channels"}, BATCH),
         Call("auto, points", {"data": "points"}, BATCH),
     ),
@@ -117,7 +117,7 @@ CALLS: dict[str, tuple[Call, ...]] = {
         Call("gaussian", {"prior": "gaussian"}),
         Call(
             "gaussian, speed and delay",
-            {"prior": "gaussian", "estimate": ["sound-speed", "delay"]},
+            {"prior": "gaussian", "estimate": ("sound-speed", "delay")},
             BATCH,
         ),
         Call("conventional", {"method": "conventional"}, BATCH),

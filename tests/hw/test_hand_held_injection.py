@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import threading
 import time
-from collections import deque
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -25,8 +24,8 @@ from hw.bench.ultrasound import ImageServer
 from hw.bench.world import make_world
 from hw.cli.main import main
 from hw.freehand.guide import Rules
-from hw.freehand.injection import _Run, acquire_by_injection, hand_advice
-from hw.freehand.posed import PosedImage
+from hw.freehand.injection import acquire_by_injection, hand_advice
+from hw.freehand.posed import PosedImage, pose_at_arrival
 from hw.freehand.request import FreeHand, FreeHandStopped
 from hw.midplane.pattern_injection import View
 from hw.planning.poses import Extent, plan_poses
@@ -308,17 +307,16 @@ def test_frames_of_the_element_that_are_late_are_not_used_and_told_of(tmp_path):
 
 def test_poses_that_a_slow_link_holds_up_are_not_those_of_the_frames_that_come_meanwhile():
     """The hand moves at 5 mm/s, and images and poses come half a second late: it was 2.5 mm on."""
-    run = object.__new__(_Run)
-    run._images = deque()
+    images = []
     for t in np.arange(0.0, 2.0, 0.05):
         pose = np.eye(4)
         pose[0, 3] = 5.0 * t
         image = Image(t + 0.5, t, 1, np.zeros((2, 2), np.uint8), (1.0, 1.0), "Image", 0.5)
-        run._images.append(PosedImage(image, t, pose))
-    pose = run._pose_at(1.01)
+        images.append(PosedImage(image, t, pose))
+    pose = pose_at_arrival(images, 1.01)
     assert not isinstance(pose, bool)
     assert pose[0, 3] == pytest.approx(5.05)
-    assert run._pose_at(2.1) is True
+    assert pose_at_arrival(images, 2.1) is True
 
 
 SETUP = """
