@@ -89,10 +89,26 @@ def test_where_few_targets_are_found_the_next_command_can_be_copied(tmp_path, ca
     frames = [FRAMES[k] for k in FOUND[:4]] + [FRAMES[HIDDEN]] * 5
     path = tmp_path / "a sweep that was recorded in the tank with the long name.igs.mha"
     write_sequence(path, {PAIR: POSES}, np.arange(COUNT) / 20, images=frames)
-    given = ["--poses", str(path), "--from", "Probe", "--to", "Tracker"]
+    text = path.read_bytes()
+    path.write_bytes(text.replace(b"UltrasoundImageOrientation = MFA\n", b""))
+    given = ["--poses", str(path), "--from", "Probe", "--to", "Tracker", "--orientation", "MF"]
     assert main(["segment", str(path), *given]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[-2].endswith("hand:")
+    assert shlex.split(lines[-1]) == ["jaxcal", "pick", str(path), *given]
+
+
+def test_points_placed_by_hand_keep_the_lag_that_was_to_be_estimated(tmp_path, lagging, capsys):
+    """The command that jaxcal pick prints at its end has no lag: images would count as prompt."""
+    times, points = lagging[0][::2], lagging[1][::2]
+    frames = [speckle(RNG, *(point if k % 5 < 2 else ())) for k, point in enumerate(points)]
+    path = tmp_path / "f.igs.mha"
+    write_sequence(path, {}, times, images=frames)
+    given = ["--poses", str(tmp_path / "t.igs.mha")]
+    assert main(["segment", str(path), *given, "--lag", "auto"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    said = " ".join(" ".join(lines[:-1]).split())
+    assert said.endswith("hand, and import them with --lag auto:")
     assert shlex.split(lines[-1]) == ["jaxcal", "pick", str(path), *given]
 
 

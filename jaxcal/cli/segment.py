@@ -211,10 +211,12 @@ def _segment_frames(source: str, out: str | None, as_json: bool, options: dict[s
     lines += [f"- not credible: {count} x {why}" for why, count in found.reasons.items()]
     lines += [f"- {note}" for note in notes if "left out" not in note]
     if counts["not credible"] > counts["found"]:
+        again = given_options(options, orientation=True)
+        later = ", and import them with --lag auto" if options["lag_s"] == "auto" else ""
         lines += [
             "- few show a credible target: look at --region and --target, or place the points by "
-            "hand:",
-            Verbatim("  " + shlex.join(["jaxcal", "pick", source, *given_options(options)])),
+            f"hand{later}:",
+            Verbatim("  " + shlex.join(["jaxcal", "pick", source, *again])),
         ]
     print_page(*lines)
     return ExitCode.CONVERGED

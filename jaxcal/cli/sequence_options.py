@@ -122,9 +122,13 @@ def search_options(command: Command) -> Command:
     return _with(command, _SEARCH)
 
 
-def given_options(options: dict[str, Any]) -> list[str]:
-    """The tracking options that were given, to type them again with ``jaxcal pick`` or import."""
+def given_options(options: dict[str, Any], *, orientation: bool = False) -> list[str]:
+    """The tracking options that were given, to type them again with ``jaxcal pick`` or import.
+
+    ``orientation``: with that of the frames, which an import of points refuses.
+    """
     names = {"poses": "poses", "from": "source", "to": "target", "lag": "lag_s"}
+    names |= {"orientation": "orientation"} if orientation else {}
     given = {name: options[key] for name, key in names.items() if options[key]}
     # Nothing is estimated where points are yet to be placed.
     return [
