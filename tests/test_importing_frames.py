@@ -92,6 +92,7 @@ def test_where_few_targets_are_found_the_next_command_can_be_copied(tmp_path, ca
     text = path.read_bytes()
     path.write_bytes(text.replace(b"UltrasoundImageOrientation = MFA\n", b""))
     given = ["--poses", str(path), "--from", "Probe", "--to", "Tracker", "--orientation", "MF"]
+    given += ["--pose-units", "mm"]
     assert main(["segment", str(path), *given]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[-2].endswith("hand:")
@@ -200,6 +201,26 @@ def pose_table(path: Path, first: str, cells, rows=range(COUNT)) -> Path:
     ]
     path.write_text("\n".join([head, *lines]))
     return path
+
+
+def test_segment_and_pick_read_tables_of_poses_as_import_does(tmp_path, folder, capsys):
+    """Their errors named --skip-invalid and --quaternion, which only jaxcal import took."""
+    rows = [f"b{k + 2}.png;{'' if k == 0 else 0.1 * k};0.05;0;1;0;0;0" for k in range(COUNT)]
+    table = tmp_path / "poses.csv"
+    table.write_text("\n".join(["file;x;y;z;qw;qx;qy;qz", *rows]))
+    poses = ["--poses", str(table)]
+    for command in (
+        ["segment", str(folder)],
+        ["pick", str(folder), str(tmp_path / "no" / "p.csv")],
+    ):
+        assert main([*command, *poses]) == 2
+        assert "leave such rows out with --skip-invalid" in capsys.readouterr().err
+    given = ["--pose-units", "m", "--quaternion", "wxyz", "--skip-invalid"]
+    assert main(["segment", str(folder), *poses, *given]) == 0
+    images = jaxcal.load(tmp_path / "images-segmented.h5").calibration
+    assert images.poses[0, :3, 3] == pytest.approx([100, 50, 0])
+    assert main(["pick", str(folder), str(tmp_path / "no" / "p.csv"), *poses, *given]) == 2
+    assert "its folder does not exist" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -640,6 +661,8 @@ def test_lags_that_cannot_be_estimated(tmp_path, lagging, folder, capsys):
         error = capsys.readouterr().err
         assert message in error
         assert error.count("\n") == 1
+    assert main(["pick", images, "--skip-invalid"]) == 2
+    assert "--skip-invalid is for tables, and none is read" in capsys.readouterr().err
     assert main(["pick", images, "--poses", tracking, "--lag", "auto"]) == 2
     assert "it is an option of jaxcal import" in capsys.readouterr().err
     assert not (tmp_path / "o.h5").exists()

@@ -25,6 +25,7 @@ from jaxcal.cli.sequence_options import (
     beside,
     given_options,
     search_options,
+    table_options,
     tracking_options,
 )
 
@@ -78,6 +79,7 @@ if TYPE_CHECKING:
 )
 @tracking_options
 @search_options
+@table_options
 @json_option
 @click.pass_context
 def segment(
