@@ -19,6 +19,7 @@ import h5py
 import jax
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 import jaxcal
 from hw.cli.main import commands as bench_commands
@@ -28,6 +29,8 @@ from jaxcal.cli import common, demo, plan
 from jaxcal.cli.main import commands, main
 from jaxcal.cli.run import run
 from jaxcal.data.recording import Recording, make_images
+from jaxcal.io.atomic import save_figure
+from jaxcal.io.outputs import begins_with, check_output
 from jaxcal.runtime import jax_cache, program_cache
 from jaxcal.study.simulation import Protocol
 
@@ -781,6 +784,13 @@ def test_plan_from_a_recording_keeps_the_region_that_no_option_changes(simulated
     assert seen.depth_mm[1] > 90
     assert region(lateral=3.0) == replace(seen, lateral_mm=(-3.0, 3.0))
     assert region(depth=(30.0, 40.0)) == replace(seen, depth_mm=(30.0, 40.0))
+
+
+@pytest.mark.parametrize("ending", ["png", "jpg", "gif", "tif", "webp", "pdf", "ps", "pgf", "svg"])
+def test_a_figure_of_a_plan_is_known_as_a_picture_and_may_be_replaced(tmp_path, ending):
+    path = tmp_path / f"plan.{ending}"
+    save_figure(Figure(figsize=(1, 1)), path)
+    check_output(path, "a picture", begins_with(*plan._PICTURES))
 
 
 def test_plan_from_nothing_is_words_and_counts(capfd):

@@ -89,10 +89,27 @@ def test_where_few_targets_are_found_the_next_command_can_be_copied(tmp_path, ca
     frames = [FRAMES[k] for k in FOUND[:4]] + [FRAMES[HIDDEN]] * 5
     path = tmp_path / "a sweep that was recorded in the tank with the long name.igs.mha"
     write_sequence(path, {PAIR: POSES}, np.arange(COUNT) / 20, images=frames)
-    given = ["--poses", str(path), "--from", "Probe", "--to", "Tracker"]
+    text = path.read_bytes()
+    path.write_bytes(text.replace(b"UltrasoundImageOrientation = MFA\n", b""))
+    given = ["--poses", str(path), "--from", "Probe", "--to", "Tracker", "--orientation", "MF"]
+    given += ["--pose-units", "mm"]
     assert main(["segment", str(path), *given]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[-2].endswith("hand:")
+    assert shlex.split(lines[-1]) == ["jaxcal", "pick", str(path), *given]
+
+
+def test_points_placed_by_hand_keep_the_lag_that_was_to_be_estimated(tmp_path, lagging, capsys):
+    """The command that jaxcal pick prints at its end has no lag: images would count as prompt."""
+    times, points = lagging[0][::2], lagging[1][::2]
+    frames = [speckle(RNG, *(point if k % 5 < 2 else ())) for k, point in enumerate(points)]
+    path = tmp_path / "f.igs.mha"
+    write_sequence(path, {}, times, images=frames)
+    given = ["--poses", str(tmp_path / "t.igs.mha")]
+    assert main(["segment", str(path), *given, "--lag", "auto"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    said = " ".join(" ".join(lines[:-1]).split())
+    assert said.endswith("hand, and import them with --lag auto:")
     assert shlex.split(lines[-1]) == ["jaxcal", "pick", str(path), *given]
 
 
@@ -184,6 +201,26 @@ def pose_table(path: Path, first: str, cells, rows=range(COUNT)) -> Path:
     ]
     path.write_text("\n".join([head, *lines]))
     return path
+
+
+def test_segment_and_pick_read_tables_of_poses_as_import_does(tmp_path, folder, capsys):
+    """Their errors named --skip-invalid and --quaternion, which only jaxcal import took."""
+    rows = [f"b{k + 2}.png;{'' if k == 0 else 0.1 * k};0.05;0;1;0;0;0" for k in range(COUNT)]
+    table = tmp_path / "poses.csv"
+    table.write_text("\n".join(["file;x;y;z;qw;qx;qy;qz", *rows]))
+    poses = ["--poses", str(table)]
+    for command in (
+        ["segment", str(folder)],
+        ["pick", str(folder), str(tmp_path / "no" / "p.csv")],
+    ):
+        assert main([*command, *poses]) == 2
+        assert "leave such rows out with --skip-invalid" in capsys.readouterr().err
+    given = ["--pose-units", "m", "--quaternion", "wxyz", "--skip-invalid"]
+    assert main(["segment", str(folder), *poses, *given]) == 0
+    images = jaxcal.load(tmp_path / "images-segmented.h5").calibration
+    assert images.poses[0, :3, 3] == pytest.approx([100, 50, 0])
+    assert main(["pick", str(folder), str(tmp_path / "no" / "p.csv"), *poses, *given]) == 2
+    assert "its folder does not exist" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -624,6 +661,8 @@ def test_lags_that_cannot_be_estimated(tmp_path, lagging, folder, capsys):
         error = capsys.readouterr().err
         assert message in error
         assert error.count("\n") == 1
+    assert main(["pick", images, "--skip-invalid"]) == 2
+    assert "--skip-invalid is for tables, and none is read" in capsys.readouterr().err
     assert main(["pick", images, "--poses", tracking, "--lag", "auto"]) == 2
     assert "it is an option of jaxcal import" in capsys.readouterr().err
     assert not (tmp_path / "o.h5").exists()

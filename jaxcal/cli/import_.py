@@ -8,7 +8,7 @@ import click
 
 from jaxcal import InputError, OutputError
 from jaxcal.cli.common import ExitCode, progress
-from jaxcal.cli.sequence_options import quaternion_option, search_options, tracking_options
+from jaxcal.cli.sequence_options import search_options, table_options, tracking_options
 from jaxcal.io.atomic import check_writable
 from jaxcal.io.outputs import RECORDING, check_output, is_recording
 
@@ -22,18 +22,7 @@ from jaxcal.io.outputs import RECORDING, check_output, is_recording
     help="Unit of u and v in a table: px (lateral and axial pixel, the default) or mm (lateral "
     "position and range).",
 )
-@click.option(
-    "--pose-units",
-    type=click.Choice(["mm", "cm", "m"]),
-    help="Unit of translations where the file of the poses does not say; mm by default.",
-)
-@quaternion_option
-@click.option(
-    "--skip-invalid",
-    is_flag=True,
-    help="Leave out, and count, rows of tables that are marked as invalid, have gaps or a pose of "
-    "zeros.",
-)
+@table_options
 @tracking_options
 @click.option(
     "--points",

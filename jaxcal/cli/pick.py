@@ -10,13 +10,14 @@ from typing import Any
 import click
 
 from jaxcal.cli.common import ExitCode
-from jaxcal.cli.sequence_options import beside, given_options, tracking_options
+from jaxcal.cli.sequence_options import beside, given_options, table_options, tracking_options
 
 
 @click.command(short_help="Place the target's point in each frame by a click.")
 @click.argument("frames", type=click.Path(), metavar="SOURCE")
 @click.argument("picks", type=click.Path(), metavar="[PICKS.csv]", required=False)
 @tracking_options
+@table_options
 @click.option(
     "--every",
     type=click.IntRange(1),

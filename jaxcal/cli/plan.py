@@ -30,7 +30,10 @@ if TYPE_CHECKING:
 _COUNTED = (0.5, 0.3, 0.2, 0.1)
 """Errors (mm) for which the images are counted, where none is asked for."""
 
-_PICTURES = (b"\x89PNG", b"\xff\xd8\xff", b"%PDF", b"%!PS", b"<?xml", b"RIFF", b"II*", b"MM")
+_PICTURES = (
+    *(b"\x89PNG", b"\xff\xd8\xff", b"GIF8", b"RIFF", b"II*", b"MM"),
+    *(b"%PDF", b"%!PS", b"%% Creator: Matplotlib", b"<?xml"),
+)
 """How files begin that matplotlib draws."""
 
 

@@ -25,6 +25,7 @@ from jaxcal.cli.sequence_options import (
     beside,
     given_options,
     search_options,
+    table_options,
     tracking_options,
 )
 
@@ -78,6 +79,7 @@ if TYPE_CHECKING:
 )
 @tracking_options
 @search_options
+@table_options
 @json_option
 @click.pass_context
 def segment(
@@ -211,10 +213,12 @@ def _segment_frames(source: str, out: str | None, as_json: bool, options: dict[s
     lines += [f"- not credible: {count} x {why}" for why, count in found.reasons.items()]
     lines += [f"- {note}" for note in notes if "left out" not in note]
     if counts["not credible"] > counts["found"]:
+        again = given_options(options, orientation=True)
+        later = ", and import them with --lag auto" if options["lag_s"] == "auto" else ""
         lines += [
             "- few show a credible target: look at --region and --target, or place the points by "
-            "hand:",
-            Verbatim("  " + shlex.join(["jaxcal", "pick", source, *given_options(options)])),
+            f"hand{later}:",
+            Verbatim("  " + shlex.join(["jaxcal", "pick", source, *again])),
         ]
     print_page(*lines)
     return ExitCode.CONVERGED

@@ -74,6 +74,20 @@ quaternion_option = click.option(
     type=click.Choice(["xyzw", "wxyz"]),
     help="Whether a quaternion's scalar is the last or the first of its numbers.",
 )
+_TABLES = (
+    click.option(
+        "--pose-units",
+        type=click.Choice(["mm", "cm", "m"]),
+        help="Unit of translations where the file of the poses does not say; mm by default.",
+    ),
+    quaternion_option,
+    click.option(
+        "--skip-invalid",
+        is_flag=True,
+        help="Leave out, and count, rows of tables that are marked as invalid, have gaps or a pose "
+        "of zeros.",
+    ),
+)
 spacing_option = click.option(
     "--spacing",
     "spacing_mm",
@@ -117,22 +131,33 @@ def tracking_options(command: Command) -> Command:
     return _with(command, _TRACKING)
 
 
+def table_options(command: Command) -> Command:
+    """Add the options that say how tables of poses are read."""
+    return _with(command, _TABLES)
+
+
 def search_options(command: Command) -> Command:
     """Add the options that say what to look for, where, and how large a pixel is."""
     return _with(command, _SEARCH)
 
 
-def given_options(options: dict[str, Any]) -> list[str]:
-    """The tracking options that were given, to type them again with ``jaxcal pick`` or import."""
+def given_options(options: dict[str, Any], *, orientation: bool = False) -> list[str]:
+    """The options of poses that were given, to type them again with ``jaxcal pick`` or import.
+
+    ``orientation``: with that of the frames, which an import of points refuses.
+    """
     names = {"poses": "poses", "from": "source", "to": "target", "lag": "lag_s"}
+    names |= {"orientation": "orientation"} if orientation else {}
+    names |= {"pose-units": "pose_units", "quaternion": "quaternion"}
     given = {name: options[key] for name, key in names.items() if options[key]}
     # Nothing is estimated where points are yet to be placed.
-    return [
+    stated = [
         part
         for name, value in given.items()
         if value != "auto"
         for part in (f"--{name}", f"{value}")
     ]
+    return stated + ["--skip-invalid"] * options["skip_invalid"]
 
 
 def beside(frames: str, ending: str) -> str:

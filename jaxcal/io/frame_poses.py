@@ -25,6 +25,8 @@ def open_sequence(
     Raises:
         InputError: files that cannot be read or do not belong together; one line.
     """
+    if options.poses is None or kind_of(options.poses) != "table":
+        refuse(options, ("quaternion", "skip_invalid"), "is for tables, and none is read")
     sequence, tracking, notes = opened(source, options)
     if tracking is None:
         return sequence, notes
