@@ -554,7 +554,9 @@ def test_curvilinear_regions_are_sectors():
 
 def test_the_figure_is_a_figure(tmp_path):
     plan = design.plan(some(200), 10)
-    design.plan_figure(plan, 0.3).savefig(tmp_path / "plan.png")
+    figure = design.plan_figure(plan, 0.3)
+    figure.savefig(tmp_path / "plan.png")
+    assert (figure.axes[2].get_xticks() % 1 == 0).all()
     assert (tmp_path / "plan.png").read_bytes().startswith(b"\x89PNG")
 
 

@@ -29,7 +29,7 @@ def plan_figure(plan: Plan, wanted_mm: float | None = None) -> Figure:
     if wanted_mm is not None and not (is_number(wanted_mm) and wanted_mm > 0):
         raise InputError(f"the wanted error must be a positive number of mm, not {wanted_mm!r}")
     from matplotlib.figure import Figure
-    from matplotlib.ticker import StrMethodFormatter
+    from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
     figure = Figure(figsize=(12.5, 4.2), dpi=130, layout="constrained")
     image, cone, errors = (
@@ -73,6 +73,7 @@ def plan_figure(plan: Plan, wanted_mm: float | None = None) -> Figure:
     errors.set(
         xlabel="images", ylabel="predicted error (mm)", yscale="log", title="how many images?"
     )
+    errors.xaxis.set_major_locator(MaxNLocator(integer=True))
     for formatted in (errors.yaxis.set_major_formatter, errors.yaxis.set_minor_formatter):
         formatted(StrMethodFormatter("{x:g}"))
     errors.grid(alpha=0.3, which="both")
