@@ -553,9 +553,14 @@ def test_curvilinear_regions_are_sectors():
     assert (np.abs(region.unit(plan.targets)) <= 1 + 1e-9).all()
 
 
-def test_the_figure_is_a_figure(tmp_path):
-    plan = design.plan(some(200), 10)
-    design.plan_figure(plan, 0.3).savefig(tmp_path / "plan.png")
+@pytest.mark.parametrize("count", [4, 10])
+def test_the_figure_is_a_figure(tmp_path, count):
+    plan = design.plan(some(200), count)
+    figure = design.plan_figure(plan, 0.3)
+    figure.savefig(tmp_path / "plan.png")
+    assert (figure.axes[2].get_xticks() % 1 == 0).all()
+    last = figure.axes[2].lines[0].get_xydata()[-1]
+    np.testing.assert_array_equal(last, [count, plan.tre_mm[-1]])
     assert (tmp_path / "plan.png").read_bytes().startswith(b"\x89PNG")
 
 

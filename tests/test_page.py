@@ -162,15 +162,30 @@ def test_a_page_that_cannot_be_written_leaves_the_old_one(tmp_path, record, resu
     assert [entry.name for entry in tmp_path.iterdir()] == ["cal.html"]
 
 
-def test_a_failed_solve_has_a_page_too(record, result, recording):
+@pytest.mark.parametrize(
+    ("status", "word"),
+    [
+        ("unobservable", "do not use"),
+        ("max_iterations", "do not trust"),
+        ("failed", "failed"),
+    ],
+)
+def test_a_failed_solve_has_a_page_too(record, result, recording, status, word):
     lost = {
-        **record, "status": "unobservable", "converged": False, "verdict": None, "tre": None,
+        **record, "status": status, "converged": False, "verdict": None, "tre": None,
         "limits": None, "influence": None, "comparison": None, "covariance": None,
         "image_covariance": None,
     }  # fmt: skip
-    text = page(lost, result, recording)
-    assert "Do not use" in text
+    unknown = replace(
+        result,
+        unknowns_covariance=np.full(np.shape(result.unknowns_covariance), np.nan),
+    )
+    text = page(lost, unknown, recording)
+    assert f'<div class="word">{word}</div>' in text
+    assert f"<p>{word.capitalize()}: " in text
     assert "How accurate" not in text
+    # No words about an ellipsoid that is not drawn.
+    assert "95 % ellipsoid" not in text
 
 
 def test_wrong_frames_leave_nothing_to_copy(record, result, recording):

@@ -321,11 +321,12 @@ def _print(found: Plan, record: dict[str, Any], figure: str | None) -> None:
         for wanted, count in record["images_to_tre_mm"].items()
     ]
     before = "" if not there else f" after the {there} that there are"
+    these = "this image" if len(found) == 1 else f"these {len(found)} images"
     print_page(
         table,
         "Tilts and turns from the middle orientation, with the marker to your right; left is where "
         "the lateral position is smallest. Take them in any order.",
-        f"Predicted with these {len(found)} images{before}: error over the image "
+        f"Predicted with {these}{before}: error over the image "
         f"{found.tre_mm[-1]:.2g} mm, reconstruction precision {found.rp_mm[-1]:.2g} mm.",
         *([f"How many images an error takes: {'; '.join(counts)}."] if counts else []),
         *(_simulated_in_words(errors) for errors in record.get("simulated", ())),

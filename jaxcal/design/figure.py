@@ -29,7 +29,7 @@ def plan_figure(plan: Plan, wanted_mm: float | None = None) -> Figure:
     if wanted_mm is not None and not (is_number(wanted_mm) and wanted_mm > 0):
         raise InputError(f"the wanted error must be a positive number of mm, not {wanted_mm!r}")
     from matplotlib.figure import Figure
-    from matplotlib.ticker import StrMethodFormatter
+    from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
     figure = Figure(figsize=(12.5, 4.2), dpi=130, layout="constrained")
     image, cone, errors = (
@@ -65,14 +65,20 @@ def plan_figure(plan: Plan, wanted_mm: float | None = None) -> Figure:
         cone.set_yticks(rings)
     cone.tick_params(axis="y", labelsize="small")
     count = plan.known.images + np.arange(len(plan.tre_mm))
-    seen = count >= 6
-    errors.plot(count[seen], plan.tre_mm[seen], color=_BLUE, label="TRE")
-    errors.plot(count[seen], plan.rp_mm[seen], color=_ORANGE, label="reconstruction precision")
+    # Errors of the first few images are so large that they would hide the others.
+    seen = count >= min(6, count[-1])
+    for values, colour, label in (
+        (plan.tre_mm, _BLUE, "TRE"),
+        (plan.rp_mm, _ORANGE, "reconstruction precision"),
+    ):
+        errors.plot(count[seen], values[seen], ".-", color=colour, label=label)
+    errors.set_xlim(count[seen][0] - 0.5, count[-1] + 0.5)
     if wanted_mm is not None:
         errors.axhline(wanted_mm, color=_GREY, linewidth=0.8, linestyle="--")
     errors.set(
         xlabel="images", ylabel="predicted error (mm)", yscale="log", title="how many images?"
     )
+    errors.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
     for formatted in (errors.yaxis.set_major_formatter, errors.yaxis.set_minor_formatter):
         formatted(StrMethodFormatter("{x:g}"))
     errors.grid(alpha=0.3, which="both")

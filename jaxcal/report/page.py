@@ -204,7 +204,7 @@ def _table(rows: Iterable[Sequence[str]], head: Sequence[str] = (), words: int =
 
 def _head(record: dict[str, Any]) -> str:
     tre = record["tre"]
-    word = record["verdict"] or "do not use"
+    word = record["verdict"] or headline(record).split(":")[0].lower()
     kind = escape(record["verdict"] or "uncertain")
     number = ""
     if _usable(record) and tre is not None and tre.get("rms_mm") is not None:
@@ -348,6 +348,8 @@ def _scene(record: dict[str, Any], answer: Calibration, recording: Recording) ->
         "dots": dots,
         "bar": svg.bar_length(float(np.linalg.norm(np.ptp(far, axis=0)))),
     }
+    close = _close_up(answer, cloud, shown)
+    ellipsoid = " with its 95 % ellipsoid (lines)" if close["lines"] else ""
     views = (
         (
             whole,
@@ -355,10 +357,10 @@ def _scene(record: dict[str, Any], answer: Calibration, recording: Recording) ->
             "Planes of the images (blue) and the target (orange), in the tracker's frame.",
         ),
         (
-            _close_up(answer, cloud, shown),
+            close,
             "scene-target",
             "The target as each image puts it (green; does not fit the rest: orange), and the "
-            "estimate with its 95 % ellipsoid (lines).",
+            f"estimate{ellipsoid}.",
         ),
     )
     parts = [
@@ -444,16 +446,18 @@ def _residuals(record: dict[str, Any], answer: Calibration) -> str:
     second = svg.series(
         [("offset (mm)", images, offset.tolist(), svg.ORANGE)],
         named,
-        "Estimated offset of the target from the image plane with one standard deviation, mm",
+        "Estimated offset of the target from the image plane, mm",
         spread=np.asarray(answer.elevation_sd)[used].tolist(),
         height=120.0,
     )
+    known = bool(np.isfinite(np.asarray(answer.elevation_sd)[used]).any())
+    spread = ", with one standard deviation (grey)" if known else ""
     parts = [
         f"<figure>{first}<figcaption>Residual of every image, one scale for all: the estimated "
         "target less the measured point taken in the plane. Rings: does not fit the rest."
         "</figcaption></figure>",
-        f"<figure>{second}<figcaption>How far the target was out of the image plane, with one "
-        "standard deviation (grey).</figcaption></figure>",
+        f"<figure>{second}<figcaption>How far the target was out of the image plane{spread}."
+        "</figcaption></figure>",
     ]
     influence = record["influence"]
     if influence is not None:

@@ -358,7 +358,7 @@ def stacked(rows: Sequence[tuple[str, Sequence[tuple[str, Any, str]]]], label: s
 
 
 def matrix_map(names: Sequence[str], values: Float[np.ndarray, "k k"], label: str) -> str:
-    """A correlation matrix: blue below zero, orange above, numbers in the cells."""
+    """A correlation matrix: blue below zero, orange above, numbers as titles of the cells."""
     count, left, top = len(names), 96.0, 6.0
     size = (WIDTH - left - 8.0) / max(count, 1)
     parts: list[str] = []
