@@ -172,7 +172,7 @@ def test_a_pose_of_zeros_is_that_of_a_tool_not_seen(tmp_path):
 
 def test_empty_rows_at_the_end_do_not_count(tmp_path):
     lines = table(NAMES, COLUMNS)
-    (tmp_path / "t.csv").write_text("\n".join([*lines, ",,,,,,,,", ",,,,,,,,", ""]))
+    (tmp_path / "t.csv").write_text("\n".join([*lines, ",,,,,,,,", ",,,", ""]))
     recording, notes, _ = import_files([tmp_path / "t.csv"])
     assert (len(recording), notes) == (6, [])
 

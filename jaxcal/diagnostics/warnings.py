@@ -123,8 +123,10 @@ def _sds_not_tuned(result: Calibration) -> list[str]:
         found.append(text)
     if np.any(result.sigma_floored):
         errors = zip(("lateral", "range", "elevational"), result.sigma_floored, strict=True)
-        names = " and ".join(name for name, floored in errors if floored)
-        found.append(f"the {names} error is too small to estimate; its SD rests on its floor")
+        names = [name for name, floored in errors if floored]
+        rest = "error is" if len(names) == 1 else "errors are"
+        owner = "its SD rests on its floor" if len(names) == 1 else "their SDs rest on their floors"
+        found.append(f"the {' and '.join(names)} {rest} too small to estimate; {owner}")
     return found
 
 

@@ -124,7 +124,7 @@ def read_table(
             names = _without_blank_end(cells, 0)
             continue
         width = len(names or rows[0]) if names or rows else len(cells)
-        cells = _without_blank_end(cells, width)
+        cells = _without_blank_end(cells, width) if any(cells) else [""] * width
         if len(cells) != width:
             before = "the header has" if names else "the rows before have"
             raise FormatError(

@@ -180,6 +180,14 @@ def _from_left_out(record: dict[str, Any]) -> list[tuple[float, str]]:
     return [(math.hypot(1.0, found["apart_mm"] / stated), words)]
 
 
+def _scatter(scatter: float, stated: float) -> str:
+    """Of corners and middle of the part of the image in which targets were seen."""
+    return (
+        f"scatter by {scatter:.2f} mm where targets were seen, {scatter / stated:.1f} times the "
+        f"{stated:.2f} mm that is stated there"
+    )
+
+
 def _from_resampling(record: dict[str, Any]) -> list[tuple[float, str]]:
     found: list[tuple[float, str]] = []
     held, drawn = record.get("cross_validation"), record.get("bootstrap")
@@ -190,23 +198,13 @@ def _from_resampling(record: dict[str, Any]) -> list[tuple[float, str]]:
         each = len(moved) / folds
         scatter = math.sqrt((folds - 1) / folds * sum(by**2 for by in moved) / each)
         if stated and scatter > SCATTER_TIMES * stated:
-            found.append(
-                (
-                    scatter / stated,
-                    f"calibrations without some of the images scatter by {scatter:.2f} mm, "
-                    f"{scatter / stated:.1f} times what is stated",
-                )
-            )
+            words = f"calibrations without some of the images {_scatter(scatter, stated)}"
+            found.append((scatter / stated, words))
     if drawn is not None and drawn["stated_mm"]:
         known = [value for value in drawn["reproducibility_mm"] if value is not None]
         scatter = math.sqrt(sum(value**2 for value in known) / max(len(known), 1))
-        if scatter > SCATTER_TIMES * drawn["stated_mm"]:
-            times = scatter / drawn["stated_mm"]
-            found.append(
-                (
-                    times,
-                    f"calibrations from images drawn anew scatter by {scatter:.2f} mm, {times:.1f} "
-                    "times what is stated",
-                )
-            )
+        stated = drawn["stated_mm"]
+        if scatter > SCATTER_TIMES * stated:
+            words = f"calibrations from images drawn anew {_scatter(scatter, stated)}"
+            found.append((scatter / stated, words))
     return found

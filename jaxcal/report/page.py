@@ -35,6 +35,7 @@ from jaxcal.report.verdict import (
     believe,
     certainty,
     headline,
+    length_form,
     limits,
     scatter,
     where,
@@ -151,11 +152,17 @@ def _shortened(record: dict[str, Any]) -> dict[str, Any]:
     return short(record)
 
 
-def _number(record: dict[str, Any], path: str, form: str, unit: str = "") -> str:
-    """A number of the record, with its path there."""
+def _value(record: dict[str, Any], path: str) -> Any:
+    """What the record holds at a path of keys and places, with dots between them."""
     value: Any = record
     for key in path.split("."):
         value = value[int(key)] if isinstance(value, list) else value[key]
+    return value
+
+
+def _number(record: dict[str, Any], path: str, form: str, unit: str = "") -> str:
+    """A number of the record, with its path there."""
+    value = _value(record, path)
     if value is None:
         return "not known"
     tail = f"&nbsp;{escape(unit)}" if unit else ""
@@ -163,11 +170,8 @@ def _number(record: dict[str, Any], path: str, form: str, unit: str = "") -> str
 
 
 def _length(record: dict[str, Any], path: str, unit: str = "") -> str:
-    """A length of the record (mm), with more digits where it is near zero, as in the verdict."""
-    value: Any = record
-    for key in path.split("."):
-        value = value[int(key)] if isinstance(value, list) else value[key]
-    return _number(record, path, ".4f" if value is not None and value < 0.0095 else ".2f", unit)
+    """A length of the record (mm), with as many digits as in the verdict."""
+    return _number(record, path, length_form(_value(record, path) or 0.0), unit)
 
 
 def _paragraphs(lines: list[str]) -> str:

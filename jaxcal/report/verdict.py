@@ -72,12 +72,14 @@ def headline(record: dict[str, Any]) -> str:
     )
 
 
+def length_form(value: float) -> str:
+    """The format of a length in mm: hundredths; tenths from 10 mm on; more digits near zero."""
+    return ".1f" if value >= 10 else ".2f" if value >= 0.0095 else ".4f"
+
+
 def _mm(value: float | None) -> str:
-    """A length in words: hundredths of mm; tenths from 10 mm on; more digits near zero."""
-    if value is None:
-        return "an unknown distance"
-    digits = 2 if value >= 0.0095 else 4
-    return f"{value:.{1 if value >= 10 else digits}f} mm"
+    """A length in words."""
+    return "an unknown distance" if value is None else f"{value:{length_form(value)}} mm"
 
 
 def why_larger(record: dict[str, Any]) -> list[str]:

@@ -90,7 +90,8 @@ def run_study(
             scheduler answers; nothing was written then.
         OutputError: the folder or a file cannot be written; what was written before stays.
         MissingExtraError: Dask is needed and not installed.
-        CalibrationError: the cluster was lost; ``resume`` continues.
+        CalibrationError: the cluster was lost, or a chunk failed in another process, whose error is
+            told; ``resume`` continues. In this process the chunk's own error is raised.
     """
     if not isinstance(spec, Study):
         raise InputError(
