@@ -142,6 +142,9 @@ def test_a_batch_of_rows_without_the_last_one():
         _ = found.warnings
     with pytest.raises(jaxcal.InputError, match="a batch holds many"):
         _ = found.wrong_frames
+    with pytest.raises(jaxcal.InputError, match="a batch holds many"):
+        found.record()
+    assert str(found).startswith("Pivot(")
 
 
 def test_bad_input_is_named():

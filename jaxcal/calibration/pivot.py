@@ -173,6 +173,8 @@ class Pivot(eqx.Module):
         """
         from jaxcal.report.pivot import pivot_record
 
+        if np.ndim(self.status_code):
+            raise InputError("a batch holds many calibrations, each with a record of its own")
         return pivot_record(self)
 
     def __str__(self) -> str:
