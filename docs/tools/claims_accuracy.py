@@ -37,20 +37,18 @@ from claims import (
 
 claim(
     README,
-    "| error against conventional calibration, on average, in {} conditions | {:.2f} to {:.2f} of "
-    "it |",
+    "| mean error, relative to conventional calibration, in {} conditions | {:.2f} to {:.2f} |",
     lambda: (len(auto()), *span(auto())),
 )
 claim(
     README,
-    "| error against the best possible (the Bayes limit), median of {} conditions | "
-    "{:.2f} times it |",
+    "| mean error, relative to the best possible (the Bayes limit), median of {} conditions | "
+    "{:.2f} |",
     lambda: (len(bayes("50")), statistics.median(bayes("50"))),
 )
 claim(
     README,
-    "| 95 % intervals that cover the truth, each of 6 parameters in {} conditions | "
-    "{:.1f} to {:.1f} % |",
+    "| coverage of 95 % intervals, for 6 parameters in {} conditions | {:.1f} to {:.1f} % |",
     lambda: (len(table("coverage")), *covered()),
 )
 claim(

@@ -26,7 +26,7 @@ SETTINGS: dict[str, tuple[str, ...]] = {
         "Boctor (2017)",
         "about 30 images with",
         "tilted by 20 to 30 degrees",
-        "expect up to 0.5 mm, up to 1.5 mm of error",
+        "expect up to 0.5 mm, up to 1.5 mm of error in the image",
         "Python 3.11 or newer",
         "BSD 3-clause",
     ),
