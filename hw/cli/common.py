@@ -32,7 +32,10 @@ controller_option = click.option(
     help="Emulated bench: series of the robot, CB (125 poses/s) or e-Series (500).  [default: cb]",
 )
 bench_seed_option = click.option(
-    "--bench-seed", type=click.IntRange(min=0), metavar="N", help="Emulated bench: which world."
+    "--bench-seed",
+    type=click.IntRange(min=0),
+    metavar="N",
+    help="Emulated bench: seed of the simulated world.",
 )
 
 

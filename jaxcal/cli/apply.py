@@ -59,12 +59,12 @@ def apply(
     skip_invalid: bool,
     out: str | None,
 ) -> int:
-    """Take image points through the calibration CAL, as a table with standard deviations.
+    """Map image points by the calibration CAL; prints a table with standard deviations.
 
     SOURCE is a table with columns u and v, and a pose (probe to tracker) if points in the tracker's
-    frame are wanted; or a recording (.h5). Standard deviations and covariances are those of the
-    calibration (estimated pixel sizes included) and of --pixel-sd; not of the pose. Images of a
-    recording that are masked out are left out; a last column, image, has the numbers of the others.
+    frame are wanted; or a recording (.h5). Standard deviations and covariances include those of the
+    calibration (with estimated pixel sizes) and of --pixel-sd, but not those of the pose. Masked
+    images of a recording are left out; a last column, image, has the numbers of the others.
     """
     import numpy as np
 

@@ -46,8 +46,8 @@ EXPORTS: tuple[SaveFormat, ...] = ("plus", "slicer", "itk", "ros", "tusrec", "nu
     type=click.Choice(get_args(Method)),
     default="joint",
     show_default=True,
-    help="joint: transform, target and elevational offsets together; alternating: the paper's; "
-    "conventional: every target is assumed to lie in the image plane.",
+    help="joint: estimate transform, target and elevational offsets together; alternating: the "
+    "paper's method; conventional: assume that every target lies in the image plane.",
 )
 @click.option(
     "--prior",
@@ -81,8 +81,8 @@ EXPORTS: tuple[SaveFormat, ...] = ("plus", "slicer", "itk", "ros", "tusrec", "nu
     type=click.Choice(get_args(Data)),
     default="auto",
     show_default=True,
-    help="What the joint method fits where the recording holds times of flight: the points that "
-    "are segmented from them, or every element's; auto: whichever says more.",
+    help="What the joint method fits if the recording holds times of flight: the points segmented "
+    "from them, or the time of every element (channels); auto: whichever holds more information.",
 )
 @click.option(
     "--robust/--no-robust",
@@ -94,7 +94,7 @@ EXPORTS: tuple[SaveFormat, ...] = ("plus", "slicer", "itk", "ros", "tusrec", "nu
 @click.option(
     "--solver",
     type=click.Choice(get_args(SolverName)),
-    help="Of the conventional method; lm by default.",
+    help="Solver of the conventional method; lm by default.",
 )
 @click.option(
     "--tolerance-mm",
@@ -124,14 +124,15 @@ EXPORTS: tuple[SaveFormat, ...] = ("plus", "slicer", "itk", "ros", "tusrec", "nu
 @click.option(
     "--cross-validate",
     is_flag=True,
-    help="Look at every image through a calibration of the others: precision on images that were "
-    "not used, and how much each image moves the answer.",
+    help="Test every image with a calibration from the others: precision on images that were not "
+    "used, and how much each image changes the calibration.",
 )
 @click.option(
     "--bootstrap",
     type=click.IntRange(2, 100_000),
     metavar="N",
-    help="Calibrate N times from images drawn anew, and tell how the answers scatter.",
+    help="Calibrate N times from images drawn with replacement, and say how the calibrations "
+    "scatter.",
 )
 @click.option(
     "--export",
@@ -185,7 +186,7 @@ def calibrate(
     out: str | None,
     as_json: bool,
 ) -> int:
-    """Calibrate from the recording REC; nobody has to supply a starting guess."""
+    """Calibrate from the recording REC. No starting guess is needed."""
     inputs = [recording] if test is None else [recording, test]
     targets = [_export_target(export, inputs, out) for export in exports]
     import_engine()

@@ -66,7 +66,7 @@ def _one_format(_: click.Context, __: click.Parameter, given: tuple[str, ...]) -
     type=POSITIVE,
     nargs=2,
     metavar="LATERAL AXIAL",
-    help="Of a calibration from points in mm: size of a pixel, mm,",
+    help="For a calibration from points in mm: size of a pixel, mm,",
 )
 @click.option(
     "--origin",

@@ -30,15 +30,15 @@ from jaxcal.cli.sequence_options import beside, given_options, table_options, tr
     type=click.IntRange(0, 65535),
     default=0,
     metavar="N",
-    help="Of the page, on 127.0.0.1; by default any that is free.",
+    help="Port of the page, on 127.0.0.1; by default any free one.",
 )
 def pick(frames: str, picks: str | None, every: int, port: int, **options: Any) -> int:
     """Place the target's point in each frame of SOURCE by a click, and save them in PICKS.csv.
 
     For frames in which `jaxcal import` finds no credible target. SOURCE is a sequence or a folder
-    of PNG. Prints the address of a page that only this machine, and only who has the address, can
-    open. Every click is saved at once; the same command goes on where it was ended. By default
-    PICKS.csv is beside SOURCE and has its name.
+    of PNG. Prints the address of a local web page, which can be opened only on this machine and
+    only with this address. Every click is saved at once; run the same command again to continue. By
+    default PICKS.csv is beside SOURCE and has its name.
     """
     from jaxcal.io.atomic import check_writable
     from jaxcal.io.frame_poses import frames_to_show, open_sequence
