@@ -198,7 +198,7 @@ def acquire(
             from hw.acquisition.dry_run import draw
 
             if request is None:
-                raise InputError("--preview draws a new plan; it does not go with --resume")
+                raise InputError("--preview draws a new plan; it cannot be used with --resume")
             draw(setup, request, preview)
         return _acquire(setup, path, request, emulated, unattended, operator, view)
 

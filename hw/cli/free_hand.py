@@ -100,7 +100,9 @@ def free_hand(
         }
         for name, given in unused.items():
             if given:
-                raise InputError(f"{name} is for segmented images: not with pattern-injection")
+                raise InputError(
+                    f"{name} is for segmented images; it cannot be used with pattern-injection"
+                )
     host, _, port = server.partition(":")
     if not host or not ((port.isdecimal() and 0 < int(port) < 65536) or not port):
         raise click.BadParameter(f"{server!r} is not HOST or HOST:PORT", param_hint="HOST[:PORT]")

@@ -179,8 +179,8 @@ class Walker:
         settings = self.settings
         if abs(offset) > settings.reach_mm:
             raise PlacementError(
-                f"the search wanted to go {offset:.1f} mm off the plan's pose; it may go "
-                f"{settings.reach_mm:g} mm"
+                f"the search would have to go {offset:.1f} mm from the planned pose, but may go "
+                f"only {settings.reach_mm:g} mm"
             )
         if self.moves >= settings.most_moves:
             raise PlacementError(f"the mid-plane was not found within {self.moves} moves")
@@ -318,8 +318,8 @@ def coarse(walker: Walker, start_mm: float = 0.0) -> float:
                 return start_mm + float(offset)
         tried = half
     raise PlacementError(
-        f"the element was not heard within {settings.span_mm:g} mm either side: is it on, is the "
-        "probe coupled, is the plan's pose right?"
+        f"the element received nothing within {settings.span_mm:g} mm either side: is it on, is "
+        "the probe coupled, is the plan's pose right?"
     )
 
 

@@ -222,7 +222,7 @@ class Session:
             if now - self._echo_seen > self.clock.patience(watch.echo_age_s):
                 return StaleError(
                     f"no frame for {now - self._echo_seen:.2f} s: is the ultrasound machine "
-                    "frozen, or its frame trigger unplugged?",
+                    "frozen, or is its frame trigger unplugged?",
                     device="active echo",
                 )
             late = self._echo_frames[-1].late_s if self._echo_frames else 0.0

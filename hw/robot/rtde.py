@@ -218,8 +218,8 @@ def too_late(latency_s: float, limit_s: float) -> LostError | None:
         return None
     return LostError(
         f"the poses may be on their way for {latency_s * 1000:.0f} ms, over the limit of "
-        f"{limit_s * 1000:.0f} ms: connect by a shorter way (a cable, no tunnel), or give this "
-        "computer less other work",
+        f"{limit_s * 1000:.0f} ms: use a more direct connection (a cable, no tunnel), or reduce "
+        "the load of this computer",
         device="robot",
     )
 
@@ -321,7 +321,7 @@ class PacketReader:
             while len(data) - start >= 3:
                 (size,) = struct.unpack_from(">H", data, start)
                 if size < 3:
-                    raise LostError("what came is no RTDE data", device="robot")
+                    raise LostError("what was received is not RTDE data", device="robot")
                 if len(data) - start < size:
                     break
                 message = bytes(data[start + 2 : start + size])
@@ -335,7 +335,7 @@ class PacketReader:
             raise refused("the controller does not speak RTDE version 2")
         answer = self._ask(b"v", b"", deadline)
         if len(answer) != 16:
-            raise LostError("the controller did not tell its version", device="robot")
+            raise LostError("the controller did not report its version", device="robot")
         self.version: tuple[int, ...] = struct.unpack(">4I", answer)
         self.frequency_hz = frequency_hz or (500.0 if self.version[0] >= 5 else 125.0)
         names = list(FIELDS)
@@ -407,7 +407,7 @@ class PacketReader:
             if len(data) >= 3:
                 (size,) = struct.unpack_from(">H", data)
                 if size < 3:
-                    raise LostError("what came is no RTDE data", device="robot")
+                    raise LostError("what was received is not RTDE data", device="robot")
                 if len(data) >= size:
                     if data[2:3] == b"U":
                         # If it is bad, :meth:`read` will say what is wrong with it.

@@ -81,7 +81,7 @@ def apply(
     }
     unused = [option for option, given in stated.items() if given]
     if unused and (source is None or _is_recording(source)):
-        raise click.UsageError(f"{', '.join(unused)}: for tables, and none is read")
+        raise click.UsageError(f"{', '.join(unused)}: for tables, but no table is read")
     if out is not None:
         inputs = [calibration] if source is None else [calibration, source]
         check_output(out, "such a table", begins_with(",".join(_COLUMNS).encode()), inputs)
@@ -137,7 +137,7 @@ def _read(source: str, quaternion, pose_units, skip_invalid: bool):
     of_poses = {"--quaternion": quaternion, "--pose-units": pose_units}
     unused = [option for option, value in of_poses.items() if value is not None]
     if unused and table.poses is None:
-        raise click.UsageError(f"{', '.join(unused)}: for poses, and {source} holds none")
+        raise click.UsageError(f"{', '.join(unused)}: for poses, but {source} holds none")
     return table.points, table.poses, table.kind, ("line", table.lines) if skip_invalid else None
 
 

@@ -339,8 +339,8 @@ def _segmented(recording: Recording) -> tuple[Recording, list[str]]:
         return recording, []
     if not raw:
         raise InputError(
-            f"{recording.source}: the test images hold times of flight beside other calibration "
-            "images: segment them first"
+            f"{recording.source}: the test images hold times of flight, but the calibration "
+            "images do not: segment them first"
         )
     from jaxcal.data.segmentation.segment import segment_recording
 

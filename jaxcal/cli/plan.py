@@ -142,7 +142,7 @@ def plan(
     if recording is None and estimate is not None:
         raise InputError("--estimate needs a recording")
     if recording is not None and sigma is not None:
-        raise InputError("--sigma does not go with a recording: its images tell the SDs")
+        raise InputError("--sigma cannot be used with a recording: its images determine the SDs")
     import_engine()
     from jaxcal import design
     from jaxcal.design.count import MOST_IMAGES

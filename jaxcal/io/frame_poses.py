@@ -26,7 +26,7 @@ def open_sequence(
         InputError: files that cannot be read or do not belong together; one line.
     """
     if options.poses is None or kind_of(options.poses) != "table":
-        refuse(options, ("quaternion", "skip_invalid"), "is for tables, and none is read")
+        refuse(options, ("quaternion", "skip_invalid"), "is for tables, but no table is read")
     sequence, tracking, notes = opened(source, options)
     if tracking is None:
         return sequence, notes

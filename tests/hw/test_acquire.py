@@ -611,7 +611,9 @@ def test_a_failing_disk_is_one_line_and_status_4(tmp_path, what):
     assert process.wait() == 4, lines
     process.stderr.close()
     assert not any("Traceback" in line or "Exception" in line for line in lines)
-    reason = "the disk takes no more: File too large" if what == "limit" else "was removed"
+    reason = (
+        "the disk cannot be written any more: File too large" if what == "limit" else "was removed"
+    )
     found = re.search(
         r"(\d+) of 12 images are in (\S+); put it right, then: .* --resume", lines[-1]
     )
