@@ -318,7 +318,7 @@ def coarse(walker: Walker, start_mm: float = 0.0) -> float:
                 return start_mm + float(offset)
         tried = half
     raise PlacementError(
-        f"the element received nothing within {settings.span_mm:g} mm either side: is it on, is "
+        f"no response of the element within {settings.span_mm:g} mm to either side: is it on, is "
         "the probe coupled, is the plan's pose right?"
     )
 
