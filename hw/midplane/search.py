@@ -241,7 +241,7 @@ class Walker:
                 return
         raise PlacementError(
             f"the response was lost, and is not heard at {place:+.2f} mm any more, where it "
-            "was: look at the element, its threshold and the coupling"
+            "was: check the element, its threshold and the coupling"
         )
 
     def leave(self) -> None:

@@ -61,14 +61,14 @@ _SAFETY_STATES = (
     (7, "emergency stop", f"release it, then {_POWER}"),
     (8, "safety violation", "read the pendant's log, then restart the robot's safety there"),
     (9, "safety fault", "read the pendant's log, then restart the controller"),
-    (10, "stopped by safety", "look at the pendant"),
+    (10, "stopped by safety", "check the pendant"),
 )
 """Bits of safety_status_bits above normal and reduced, and what a person must do."""
 _SUMMARIES = (1 << 7) | (1 << 10)
 """Bits that are set besides the one that says more."""
 _MODES = {
-    -1: ("no controller", "look at the pendant"),
-    0: ("disconnected", "look at the pendant"),
+    -1: ("no controller", "check the pendant"),
+    0: ("disconnected", "check the pendant"),
     1: ("waiting for its safety configuration", "confirm it at the pendant"),
     2: ("booting", "wait until it has started"),
     3: ("powered off", _POWER),
@@ -88,7 +88,7 @@ def safety_text(bits: int) -> str:
     shown = wrong & ~_SUMMARIES or wrong
     found = [state for state in _SAFETY_STATES if shown >> state[0] & 1]
     if not found:
-        return f"safety bits {bits:#x}: look at the pendant" if wrong else ""
+        return f"safety bits {bits:#x}: check the pendant" if wrong else ""
     return f"{', '.join(name for _, name, _ in found)}: {found[-1][2]}"
 
 
@@ -97,7 +97,7 @@ def state_text(robot_mode: int, safety_bits: int) -> str:
     problem = safety_text(safety_bits)
     if problem or robot_mode == RUNNING_MODE:
         return problem
-    name, cure = _MODES.get(robot_mode, (f"in mode {robot_mode}", "look at the pendant"))
+    name, cure = _MODES.get(robot_mode, (f"in mode {robot_mode}", "check the pendant"))
     return f"the robot is not running, it is {name}: {cure}"
 
 
