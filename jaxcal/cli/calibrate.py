@@ -55,7 +55,7 @@ EXPORTS: tuple[SaveFormat, ...] = ("plus", "slicer", "itk", "ros", "tusrec", "nu
     default="auto",
     show_default=True,
     help="Distribution of the offsets in the joint method; auto: an average over several, "
-    "weighed by the data.",
+    "weighted by their probability.",
 )
 @click.option(
     "--max-elevation",
@@ -101,19 +101,19 @@ EXPORTS: tuple[SaveFormat, ...] = ("plus", "slicer", "itk", "ros", "tusrec", "nu
     type=POSITIVE,
     metavar="MM",
     help="The alternation stops when a round moves the transform by less than this (0.1 by "
-    "default)",
+    "default) and turns it by less than --tolerance-rad.",
 )
 @click.option(
     "--tolerance-rad",
     type=POSITIVE,
     metavar="RAD",
-    help="and turns it by less than this (0.001 by default).",
+    help="Rotation below which the alternation stops, see --tolerance-mm (0.001 by default).",
 )
 @click.option(
     "--max-rounds",
     type=click.IntRange(min=1),
     metavar="N",
-    help="Most rounds of the alternation (1000 by default).",
+    help="Largest number of rounds of the alternation (1000 by default).",
 )
 @click.option(
     "--test",
@@ -305,8 +305,8 @@ def _check_pixels(recording: Recording, targets: list[tuple[SaveFormat, str]]) -
     for format, path in targets:
         if needs_pixels(path, format):
             raise InputError(
-                f"--export {format}:{path}: {recording.source} holds no pixels, whose size this "
-                "format needs: calibrate with --out, then jaxcal export with --pixel-size"
+                f"--export {format}:{path}: {recording.source} holds no pixels, but this format "
+                "needs their size: calibrate with --out, then jaxcal export with --pixel-size"
             )
 
 
@@ -320,7 +320,7 @@ def _export(
     from jaxcal.result.saved import transform_from_record
 
     if not record["converged"] or record["wrong_frames"]:
-        return ["exported: nothing, since the calibration is not to be used"]
+        return ["exported: nothing, because the calibration must not be used"]
     transform = transform_from_record(record, source=recording)
     said: list[str] = []
     for format, path in targets:

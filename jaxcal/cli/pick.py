@@ -62,7 +62,7 @@ def pick(frames: str, picks: str | None, every: int, port: int, **options: Any) 
     with Picker(placed, pictures, name, port) as page:
         try:
             click.echo(f"{len(shown)} frames to show; open {page.url}")
-            click.echo("Finish on the page, or Ctrl-C, ends; every click is saved")
+            click.echo("to end: Finish on the page, or Ctrl-C; every click is saved")
             while not page.wait(0.5):
                 pass
         except KeyboardInterrupt:
@@ -78,7 +78,7 @@ def _tell(placed: Any, source: str, out: str, options: dict[str, Any]) -> None:
         return
     click.echo(
         f"{out}: {count} points, {len(placed.skipped)} frames skipped"
-        + (f", {left} still to do (the same command goes on)" if left else "")
+        + (f", {left} still to do (the same command continues)" if left else "")
     )
     if count:
         import_them = ["jaxcal", "import", source, out, "OUT.h5", *given_options(options)]

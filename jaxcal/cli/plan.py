@@ -329,14 +329,14 @@ def _print(found: Plan, record: dict[str, Any], figure: str | None) -> None:
         "the lateral position is smallest. Take them in any order.",
         f"Predicted with {these}{before}: error over the image "
         f"{found.tre_mm[-1]:.2g} mm, reconstruction precision {found.rp_mm[-1]:.2g} mm.",
-        *([f"How many images an error takes: {'; '.join(counts)}."] if counts else []),
+        *([f"Images needed: {'; '.join(counts)}."] if counts else []),
         *(_simulated_in_words(errors) for errors in record.get("simulated", ())),
         *([] if figure is None else [f"figure: {figure}"]),
     )
 
 
 def _simulated_in_words(errors: dict[str, Any]) -> str:
-    lost = f" {errors['lost']} had no answer." if errors["lost"] else ""
+    lost = f" {errors['lost']} could not be calibrated." if errors["lost"] else ""
     return (
         f"In {errors['trials']} simulated recordings with {errors['law']} offsets: error over the "
         f"image {errors['tre_mm']:.2g} mm (below {errors['tre_95_mm']:.2g} mm in 95 of 100), "

@@ -217,7 +217,7 @@ def _segment_frames(source: str, out: str | None, as_json: bool, options: dict[s
         again = given_options(options, orientation=True)
         later = ", and import them with --lag auto" if options["lag_s"] == "auto" else ""
         lines += [
-            "- few show a credible target: look at --region and --target, or place the points by "
+            "- few show a credible target: check --region and --target, or place the points by "
             f"hand{later}:",
             Verbatim("  " + shlex.join(["jaxcal", "pick", source, *again])),
         ]
