@@ -156,8 +156,8 @@ EXPORTS: tuple[SaveFormat, ...] = ("plus", "slicer", "itk", "ros", "tusrec", "nu
     type=click.Choice(WORDS),
     default=REQUIRED,
     show_default=True,
-    help="Exit with status 5 if the verdict is worse: good is an error up to 0.5 mm at the image, "
-    "fair up to 1.5 mm.",
+    help="Exit with status 5 if the verdict is worse: good is an error up to 0.5 mm at the image "
+    "(its interval up to 1.5 mm), fair up to 1.5 mm (4.5 mm).",
 )
 @click.option("--report", type=click.Path(), metavar="HTML", help="Write a page for a browser.")
 @click.option("--out", type=click.Path(), metavar="DIR", help="Write a report to this folder.")
