@@ -738,6 +738,19 @@ def test_cache_clear_removes_what_jax_keeps_there(tmp_path, monkeypatch):
     assert os.listdir(folder) == []
 
 
+def test_servers_have_a_host_and_a_port():
+    for text, found in (
+        ("localhost", ("localhost", 18944)),
+        ("10.0.0.2:18945", ("10.0.0.2", 18945)),
+        ("::1", ("::1", 18944)),
+        ("[::1]:80", ("::1", 80)),
+    ):
+        assert common.Server().convert(text, None, None) == found
+    for text in ("", ":80", "a:", "a:0", "a:65536", "a:b", "[::1", "[::1]x"):
+        with pytest.raises(click.BadParameter, match="is not HOST or HOST:PORT"):
+            common.Server().convert(text, None, None)
+
+
 def test_numbers_are_positive_and_finite():
     assert common.POSITIVE.convert("1e-3", None, None) == 1e-3
     assert common.NOT_NEGATIVE.convert("0", None, None) == 0
