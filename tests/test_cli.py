@@ -271,9 +271,12 @@ def test_calibrate_writes_the_whole_report(calibrated):
 
 
 @pytest.mark.usefixtures("calibrated")
-def test_calibrate_speaks_to_a_person(simulated, capfd, monkeypatch):
+def test_calibrate_speaks_to_a_person(simulated, capfd, monkeypatch, tmp_path):
     monkeypatch.setenv("COLUMNS", "100")
-    out = told(capfd, "calibrate", simulated)
+    monkeypatch.chdir(tmp_path)
+    out = told(capfd, "calibrate", simulated, "--report", "cal.html")
+    assert out.endswith("\n\nreport: cal.html\n")
+    assert (tmp_path / "cal.html").read_text().startswith("<!DOCTYPE html>")
     assert "image_plane_to_probe (mm)" in out
     assert "the target stays within" in out
     assert max(map(len, out.splitlines())) <= 100

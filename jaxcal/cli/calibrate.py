@@ -252,7 +252,7 @@ def calibrate(
     if as_json:
         print_json(record | ({"exported": exported} if targets else {}))
     else:
-        _print(record, out)
+        _print(record, [path for path in (out, report) if path is not None])
         print_page(*exported)
     return verdict_code(record, require)
 
@@ -434,10 +434,11 @@ def _curves(recording: Recording, request: Request, result: Calibration) -> list
     )
 
 
-def _print(record: dict[str, Any], out: str | None) -> None:
+def _print(record: dict[str, Any], reports: list[str]) -> None:
     from jaxcal.report.next_poses import next_poses_sentences
     from jaxcal.report.tables import calibration_table
     from jaxcal.report.verdict import verdict
 
-    report = [] if out is None else ["", f"report: {out}"]
-    print_page(calibration_table(record), *verdict(record), *next_poses_sentences(record), *report)
+    told = [*verdict(record), *next_poses_sentences(record)]
+    written = [f"report: {path}" for path in reports]
+    print_page(calibration_table(record), *told, *([""] if written else []), *written)
