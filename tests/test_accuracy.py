@@ -338,6 +338,16 @@ def test_word_and_number_are_of_one_quantity(record):
             assert f"{error:.2f} mm" in verdict(changed)[0]
 
 
+def test_a_small_error_with_a_wide_interval_is_not_good(record):
+    """As of four images with the conventional method: one degree of freedom."""
+    for upper, word in ((1.4, "good"), (1.6, "fair"), (4.4, "fair"), (4.6, "uncertain")):
+        changed = stating(record, 0.4)
+        changed["tre"]["stated_interval_mm"] = [0.1, upper]
+        settle(changed)
+        assert changed["verdict"] == word
+        assert any("Add images" in line for line in verdict(changed)) == (word == "uncertain")
+
+
 def contradicted(kind, record):
     changed = stating(record, 0.4)
     count = changed["images"]

@@ -271,9 +271,12 @@ def test_calibrate_writes_the_whole_report(calibrated):
 
 
 @pytest.mark.usefixtures("calibrated")
-def test_calibrate_speaks_to_a_person(simulated, capfd, monkeypatch):
+def test_calibrate_speaks_to_a_person(simulated, capfd, monkeypatch, tmp_path):
     monkeypatch.setenv("COLUMNS", "100")
-    out = told(capfd, "calibrate", simulated)
+    monkeypatch.chdir(tmp_path)
+    out = told(capfd, "calibrate", simulated, "--report", "cal.html")
+    assert out.endswith("\n\nreport: cal.html\n")
+    assert (tmp_path / "cal.html").read_text().startswith("<!DOCTYPE html>")
     assert "image_plane_to_probe (mm)" in out
     assert "the target stays within" in out
     assert max(map(len, out.splitlines())) <= 100
@@ -455,11 +458,8 @@ def test_a_name_cannot_break_the_one_line(capfd):
     assert r"a b\x1b[31m\udc80.h5: no such file" in line
 
 
-def test_simulate_into_no_folder(capfd, tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        "jaxcal.study.simulation.simulate_recording", lambda *_, **__: jaxcal.load(tmp_path)
-    )
-    assert "is a directory" in refused(capfd, "simulate", tmp_path / "no" / "x.h5")
+def test_simulate_into_no_folder(capfd, tmp_path):
+    assert "its folder does not exist" in refused(capfd, "simulate", tmp_path / "no" / "x.h5")
 
 
 def table(count, columns):
@@ -500,24 +500,27 @@ def test_import_pair(tmp_path, capfd):
     assert sources[1].read_bytes() == before
 
 
-def test_ctrl_c_is_one_line(capfd, monkeypatch):
+def ended(command):
+    """The exit status of a program that has this command only."""
+    return run(click.Group(commands=[click.command("do")(command)]), "jaxcal", ["do"])
+
+
+def test_ctrl_c_is_one_line(capfd):
     def interrupt():
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(demo, "import_engine", interrupt)
-    assert main(["demo"]) == 130
+    assert ended(interrupt) == 130
     assert capfd.readouterr() == ("", "jaxcal: interrupted\n")
 
 
-def test_a_further_ctrl_c_does_not_hide_what_was_to_be_told(capfd, monkeypatch):
+def test_a_further_ctrl_c_does_not_hide_what_was_to_be_told(capfd):
     def fail():
         try:
             raise DeviceError("interrupted; resume it", device="robot")
         finally:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(demo, "import_engine", fail)
-    assert main(["demo"]) == 130
+    assert ended(fail) == 130
     assert capfd.readouterr() == ("", "jaxcal: error: robot: interrupted; resume it\n")
 
 
@@ -540,7 +543,6 @@ def test_ctrl_c_where_python_cannot_raise_it_is_not_lost(capfd):
             times.append(phase)
             signal.raise_signal(signal.SIGINT)
 
-    @click.command()
     def command():
         gc.callbacks.append(callback)
         gc.collect()
@@ -549,7 +551,7 @@ def test_ctrl_c_where_python_cannot_raise_it_is_not_lost(capfd):
 
     before = sys.unraisablehook
     try:
-        assert run(click.Group(commands=[command]), "jaxcal", ["command"]) == 130
+        assert ended(command) == 130
     finally:
         gc.callbacks.remove(callback)
     assert capfd.readouterr() == ("", "jaxcal: interrupted\n")
@@ -575,14 +577,13 @@ def test_a_bug_is_one_line_too(capfd, monkeypatch):
     def fail():
         raise ZeroDivisionError("a\nb")
 
-    monkeypatch.setattr(demo, "import_engine", fail)
-    assert main(["demo"]) == 1
+    assert ended(fail) == 1
     err = capfd.readouterr().err
     assert err.startswith("jaxcal: internal error: ZeroDivisionError: a b (please report")
     assert err.count("\n") == 1
     monkeypatch.setenv("JAXCAL_TRACEBACK", "1")
     with pytest.raises(ZeroDivisionError):
-        main(["demo"])
+        ended(fail)
 
 
 @pytest.mark.parametrize("encoding", ["cp1252", "utf-8"])
@@ -740,6 +741,19 @@ def test_cache_clear_removes_what_jax_keeps_there(tmp_path, monkeypatch):
     assert os.listdir(folder) == []
 
 
+def test_servers_have_a_host_and_a_port():
+    for text, found in (
+        ("localhost", ("localhost", 18944)),
+        ("10.0.0.2:18945", ("10.0.0.2", 18945)),
+        ("::1", ("::1", 18944)),
+        ("[::1]:80", ("::1", 80)),
+    ):
+        assert common.Server().convert(text, None, None) == found
+    for text in ("", ":80", "a:", "a:0", "a:65536", "a:b", "[::1", "[::1]x"):
+        with pytest.raises(click.BadParameter, match="is not HOST or HOST:PORT"):
+            common.Server().convert(text, None, None)
+
+
 def test_numbers_are_positive_and_finite():
     assert common.POSITIVE.convert("1e-3", None, None) == 1e-3
     assert common.NOT_NEGATIVE.convert("0", None, None) == 0
@@ -775,18 +789,35 @@ def test_plan_from_a_recording_says_what_to_add(simulated, capfd, tmp_path):
 
 
 @pytest.mark.usefixtures("calibrated")
-def test_plan_from_a_recording_keeps_the_region_that_no_option_changes(simulated):
-    def region(depth=None, lateral=None):
-        chosen = plan._from_recording(str(simulated), None, None, depth, lateral, None, None, 0)
-        return chosen[1].constraints.region
+def test_plan_from_a_recording_keeps_the_region_that_no_option_changes(simulated, capfd):
+    def region(*options):
+        return json.loads(told(capfd, "plan", simulated, "--images", 1, "--json", *options))[
+            "region"
+        ]
 
     seen = region()
-    assert seen.depth_mm[1] > 90
-    assert region(lateral=3.0) == replace(seen, lateral_mm=(-3.0, 3.0))
-    assert region(depth=(30.0, 40.0)) == replace(seen, depth_mm=(30.0, 40.0))
+    assert seen["depth_mm"][1] > 90
+    assert region("--lateral", 3) == seen | {"lateral_mm": [-3.0, 3.0]}
+    assert region("--depth", 30, 40) == seen | {"depth_mm": [30.0, 40.0]}
 
 
-@pytest.mark.parametrize("ending", ["png", "jpg", "gif", "tif", "webp", "pdf", "ps", "pgf", "svg"])
+@pytest.mark.usefixtures("calibrated")
+def test_nothing_is_planned_from_wrong_frames_or_with_a_delay(simulated, tmp_path, capfd):
+    recording = jaxcal.load(simulated)
+    mirrored = recording.calibration.poses.copy()
+    mirrored[:, 0, 3] *= -1.0
+    images = replace(recording.calibration, poses=mirrored)
+    jaxcal.save(replace(recording, calibration=images), tmp_path / "mirrored.h5")
+    for arguments, said in (
+        ([], "translations have the wrong sign"),
+        (["--estimate", "sound-speed,delay"], "no plan is made with it"),
+    ):
+        assert said in refused(capfd, "plan", tmp_path / "mirrored.h5", *arguments)
+
+
+@pytest.mark.parametrize(
+    "ending", ["png", "jpg", "gif", "tif", "webp", "pdf", "ps", "pgf", "svg", "svgz"]
+)
 def test_a_figure_of_a_plan_is_known_as_a_picture_and_may_be_replaced(tmp_path, ending):
     path = tmp_path / f"plan.{ending}"
     save_figure(Figure(figsize=(1, 1)), path)

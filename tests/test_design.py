@@ -21,7 +21,7 @@ from jaxcal import InputError, design
 from jaxcal.data import geometry
 from jaxcal.data.recording import Recording, make_images
 from jaxcal.design import Constraints, Model, Noise, Region
-from jaxcal.design.candidates import sobol_poses, sobol_sequence
+from jaxcal.design.candidates import seen_region, sobol_poses, sobol_sequence
 from jaxcal.design.criteria import check_criterion, gains, rp_weight, tre_weight, weight_of
 from jaxcal.design.greedy import Rules, are_alike
 from jaxcal.design.information import Known, covariance_of, known_information
@@ -551,6 +551,14 @@ def test_curvilinear_regions_are_sectors():
     candidates = design.make_candidates(jaxcal.CurvilinearProbe(), count=300)
     plan = design.plan(candidates, 8)
     assert (np.abs(region.unit(plan.targets)) <= 1 + 1e-9).all()
+
+
+def test_the_region_of_a_shallow_target_is_where_it_was():
+    targets = np.array([[-2.0, 0.0, 1.5], [2.0, 0.0, 8.0]])
+    images = make_images(np.tile(np.eye(4), (4, 1, 1)), np.ones((4, 2)))
+    assert seen_region(Recording(images), targets).depth_mm == (1.5, 11.0)
+    targets[:, 2] += 4.0
+    assert seen_region(Recording(images), targets).depth_mm == (5.0, 15.0)
 
 
 @pytest.mark.parametrize("count", [4, 10])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from functools import partial
 from importlib import import_module
 from pathlib import Path
 
@@ -14,7 +13,6 @@ from scipy.spatial.transform import Rotation
 
 import jaxcal
 from jaxcal.cli.common import ExitCode, exit_code
-from jaxcal.cli.main import main
 from jaxcal.data.poses import inverse_poses
 from jaxcal.data.recording import make_images
 from jaxcal.diagnostics.frame_checks import wrong_frames
@@ -76,21 +74,6 @@ def test_whoever_has_wrong_frames_gets_neither_poses_nor_files(slips, tmp_path):
     assert next_poses_record(result, recording) is None
     with pytest.raises(jaxcal.InputError, match="must not be used"):
         result.save(tmp_path / "cal.npz")
-
-
-def test_nothing_is_planned_from_wrong_frames_or_with_a_delay(slips, tmp_path, monkeypatch, capsys):
-    make, _ = slips.SLIPS["inverse poses"]
-    path = str(tmp_path / "rec.h5")
-    jaxcal.save(jaxcal.Recording(make(slips.recorded(0, "mm")).images()), path)
-    # The plan's own method has nothing to do with it, and takes longer.
-    quick = partial(jaxcal.calibrate, method="conventional")
-    monkeypatch.setattr("jaxcal.calibration.calibrate.calibrate", quick)
-    for arguments, said in (
-        ([], "poses are from the tracker to the probe: invert them"),
-        (["--estimate", "sound-speed,delay"], "no plan is made with it"),
-    ):
-        assert main(["plan", path, "--images", "2", *arguments]) == 2
-        assert said in capsys.readouterr().err
 
 
 def test_noise_outliers_and_few_images_are_no_slips(slips):

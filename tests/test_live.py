@@ -51,6 +51,8 @@ def test_bad_images_are_refused_and_not_kept():
     for capacity in (3, 10**6):
         with pytest.raises(jaxcal.InputError, match="capacity"):
             LiveCalibration(capacity=capacity)
+    with pytest.raises(jaxcal.InputError, match="two positive numbers"):
+        LiveCalibration(kind="pixel", spacing_mm=(0.1, -0.1))
 
 
 def test_times_of_flight_come_to_what_the_file_comes_to():

@@ -313,6 +313,8 @@ for call, *given in (
         dataclasses.replace(jaxcal.stack([problem]), mask=mask), "conventional"), np.ones((2, 9))),
     (backend.Iterate.of, of_one, backend.RIGID),
     (backend.circle_residual, of_one, np.zeros(3), problem),
+    (lambda kind: LiveCalibration(kind=kind), "px"),
+    (lambda mask: jaxcal.reconstruction_precision(np.eye(4), poses, points, mask), np.full(9, 0.5)),
     (LiveCalibration, 8.5), (LiveCalibration, "many"),
     (lambda probe: LiveCalibration(probe=probe), "linear"),
     (LiveCalibration().add, np.eye(4), "0 50"), (LiveCalibration().leave_out, "a"),
@@ -328,7 +330,7 @@ for call, *given in (
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stderr == ""
     lines = done.stdout.splitlines()
-    assert len(lines) == 189
+    assert len(lines) == 191
     assert lines[0].startswith("jaxcal.calibrate takes a problem, not a path: ")
     assert lines[3].startswith("jaxcal.calibrate_batch takes a problem or a recording, not int: ")
     assert lines[4] == "points must have shape (..., 2), not (1, 3)"

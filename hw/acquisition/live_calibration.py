@@ -13,7 +13,15 @@ from jaxcal.calibration.calibrate import calibrate
 from jaxcal.data.poses import check_poses
 from jaxcal.data.probe import Probe, check_probe
 from jaxcal.data.problem import Problem
-from jaxcal.data.recording import MINIMUM_IMAGES, Kind, Recording, make_images, used_values
+from jaxcal.data.recording import (
+    MINIMUM_IMAGES,
+    Kind,
+    Recording,
+    check_kind,
+    check_spacing,
+    make_images,
+    used_values,
+)
 from jaxcal.data.segmentation.segment import MINIMUM_LINES, check_times_of_flight
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.arrays import real_array
@@ -36,8 +44,8 @@ class LiveCalibration:
         arguments: passed on to :func:`jaxcal.calibrate`, e.g. ``method="joint"``.
 
     Raises:
-        InputError: capacity that is no whole number from 4 to 100,000; times of flight without a
-            probe, or something else in its place.
+        InputError: capacity that is no whole number from 4 to 100,000; another kind; a spacing that
+            cannot be; times of flight without a probe, or something else in its place.
     """
 
     def __init__(
@@ -54,9 +62,10 @@ class LiveCalibration:
             check_probe(probe)
         if kind == "time_of_flight" and probe is None:
             raise InputError("times of flight need a probe")
+        check_kind(kind)
         self._probe = probe
         self._kind: Kind = kind
-        self._spacing = spacing_mm
+        self._spacing = check_spacing(spacing_mm, kind)
         self._arguments = arguments
         self._poses = np.tile(np.eye(4), (capacity, 1, 1))
         columns = probe.elements if probe is not None and kind == "time_of_flight" else 2

@@ -11,12 +11,12 @@ import click
 from hw.cli.common import check_resumed
 from hw.runtime.choices import HAND_PLACEMENTS
 from jaxcal import InputError
-from jaxcal.cli.common import verdict_code
+from jaxcal.cli.common import Server, verdict_code
 from jaxcal.cli.sequence_options import spacing_option
 
 
 @click.command("free-hand", short_help="Acquire with a hand-held probe, and calibrate.")
-@click.argument("server", metavar="HOST[:PORT]")
+@click.argument("server", type=Server(), metavar="HOST[:PORT]")
 @click.argument("recording", type=click.Path(), required=False)
 @click.option(
     "--images", type=click.IntRange(4, 1000), default=30, show_default=True, help="To take."
@@ -64,7 +64,7 @@ from jaxcal.cli.sequence_options import spacing_option
 )
 @click.option("--resume", is_flag=True, help="Continue RECORDING with its own options.")
 def free_hand(
-    server: str,
+    server: tuple[str, int],
     recording: str | None,
     resume: bool,
     target: str,
@@ -103,12 +103,9 @@ def free_hand(
                 raise InputError(
                     f"{name} is for segmented images; it cannot be used with pattern-injection"
                 )
-    host, _, port = server.partition(":")
-    if not host or not ((port.isdecimal() and 0 < int(port) < 65536) or not port):
-        raise click.BadParameter(f"{server!r} is not HOST or HOST:PORT", param_hint="HOST[:PORT]")
     path = recording or f"free-hand-{datetime.now():%Y%m%d-%H%M%S}.h5"
     rules = Rules(target="cross" if target == "cross" else "echo", region=region)
-    asked = FreeHand(host, int(port or 18944), rules=rules, **options)
+    asked = FreeHand(*server, rules=rules, **options)
     from hw.midplane.terminal_image import Screen
     from hw.runtime.keys import Keyboard, Pause
 

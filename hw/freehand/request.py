@@ -17,6 +17,7 @@ from jaxcal import CalibrationError, InputError
 from jaxcal.cli.common import ExitCode
 from jaxcal.data.recording import MINIMUM_IMAGES, check_spacing_unit
 from jaxcal.io.frame_names import FramePair
+from jaxcal.io.openigtlink import PORT
 
 _ENOUGH = 30
 """Default number of images to take."""
@@ -43,7 +44,7 @@ class FreeHand:
     """
 
     host: str
-    port: int = 18944
+    port: int = PORT
     images: int = _ENOUGH
     source: str | None = None
     target_frame: str | None = None

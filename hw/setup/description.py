@@ -22,10 +22,10 @@ from hw.robot.limits import FURTHEST_TIP_MM, Limits, hull_of, numbers
 from hw.runtime.clock import REAL, Clock
 from hw.runtime.errors import RefusedError, refused
 from hw.runtime.hosts import check_host
-from hw.ultrasound.receiver import PORT
 from jaxcal import InputError
 from jaxcal.data.poses import check_poses
 from jaxcal.data.probe import LinearProbe
+from jaxcal.io.openigtlink import PORT
 from jaxcal.io.readable import naming
 from jaxcal.io.toml import load_toml
 from jaxcal.runtime.array_types import Float

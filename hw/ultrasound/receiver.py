@@ -19,13 +19,11 @@ from hw.runtime.clock import REAL, Clock, Lag
 from hw.runtime.errors import Device, DeviceError, LostError, StaleError
 from hw.ultrasound.framing import MessageDecoder
 from jaxcal.io.message_content import Picture, Pixels, StatusMessage, Tracked, TrackedFrame
-from jaxcal.io.openigtlink import RF_DEVICE, Message
+from jaxcal.io.openigtlink import PORT, RF_DEVICE, Message
 from jaxcal.io.readable import one_line
 from jaxcal.runtime.array_types import Float
 
 DEVICE: Device = "ultrasound"
-PORT = 18944
-"""OpenIGTLink's registered port."""
 
 _CONNECT_TIMEOUT_S = 5.0
 _POLL_S = 0.05

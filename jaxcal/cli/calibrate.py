@@ -157,8 +157,8 @@ EXPORTS: tuple[SaveFormat, ...] = ("plus", "slicer", "itk", "ros", "tusrec", "nu
     type=click.Choice(WORDS),
     default=REQUIRED,
     show_default=True,
-    help="Exit with status 5 if the verdict is worse: good is an error up to 0.5 mm at the image, "
-    "fair up to 1.5 mm.",
+    help="Exit with status 5 if the verdict is worse: good is an error up to 0.5 mm at the image "
+    "(its interval up to 1.5 mm), fair up to 1.5 mm (4.5 mm).",
 )
 @click.option("--report", type=click.Path(), metavar="HTML", help="Write a page for a browser.")
 @click.option("--out", type=click.Path(), metavar="DIR", help="Write a report to this folder.")
@@ -253,7 +253,7 @@ def calibrate(
     if as_json:
         print_json(record | ({"exported": exported} if targets else {}))
     else:
-        _print(record, out)
+        _print(record, [path for path in (out, report) if path is not None])
         print_page(*exported)
     return verdict_code(record, require)
 
@@ -435,10 +435,11 @@ def _curves(recording: Recording, request: Request, result: Calibration) -> list
     )
 
 
-def _print(record: dict[str, Any], out: str | None) -> None:
+def _print(record: dict[str, Any], reports: list[str]) -> None:
     from jaxcal.report.next_poses import next_poses_sentences
     from jaxcal.report.tables import calibration_table
     from jaxcal.report.verdict import verdict
 
-    report = [] if out is None else ["", f"report: {out}"]
-    print_page(calibration_table(record), *verdict(record), *next_poses_sentences(record), *report)
+    told = [*verdict(record), *next_poses_sentences(record)]
+    written = [f"report: {path}" for path in reports]
+    print_page(calibration_table(record), *told, *([""] if written else []), *written)

@@ -7,6 +7,7 @@ import importlib
 import json
 import math
 import os
+import re
 import signal
 import sys
 import threading
@@ -59,6 +60,26 @@ class Number(click.ParamType):
             wanted = "zero or a positive number" if self.zero else "a positive number"
             self.fail(f"{value!r} is not {wanted}", param, ctx)
         return number
+
+
+class Server(click.ParamType):
+    """HOST, HOST:PORT or [HOST]:PORT (IPv6) as host and port; without a port, OpenIGTLink's."""
+
+    name = "server"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[str, int]:
+        """The host and the port, or a usage error."""
+        from jaxcal.io.openigtlink import PORT
+
+        ipv6_alone = value.count(":") > 1 and not value.startswith("[")
+        text = f"[{value}]" if ipv6_alone else value
+        found = re.fullmatch(r"(\[[^][]+\]|[^][:]+)(?::([0-9]{1,5}))?", text)
+        port = int(found[2] or PORT) if found else 0
+        if not (found and 0 < port < 65536):
+            self.fail(f"{value!r} is not HOST or HOST:PORT", param, ctx)
+        return found[1].strip("[]"), port
 
 
 POSITIVE = Number()

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from jaxcal.cli.common import POSITIVE, ExitCode
+from jaxcal.cli.common import POSITIVE, ExitCode, Server
 
 if TYPE_CHECKING:
     from jaxcal.result.transform import ImageTransform, SaveFormat
@@ -56,6 +56,7 @@ def _one_format(_: click.Context, __: click.Parameter, given: tuple[str, ...]) -
 )
 @click.option(
     "--plus-server",
+    type=Server(),
     metavar="HOST[:PORT]",
     help="Set the transform in a PlusServer that is running (port 18944 by default).",
 )
@@ -80,7 +81,7 @@ def export(
     out: str | None,
     format: SaveFormat | None,
     plus_config: str | None,
-    plus_server: str | None,
+    plus_server: tuple[str, int] | None,
     image_frame: str,
     probe_frame: str,
     pixel_size: tuple[float, float] | None,
@@ -187,18 +188,12 @@ def patched(
     return [written, *(f"- {note}" for note in notes)]
 
 
-def sent(transform: ImageTransform, server: str, frames: tuple[str, str]) -> str:
+def sent(transform: ImageTransform, server: tuple[str, int], frames: tuple[str, str]) -> str:
     """Set a transform in a running PlusServer; what was done."""
-    from jaxcal.io.plus_server import PORT, update_transform
+    from jaxcal.io.plus_server import update_transform
 
-    host, colon, text = server.rpartition(":") if server.count(":") == 1 else (server, "", "")
-    if colon and not (text.isdigit() and 0 < int(text) < 65536):
-        raise click.BadParameter(f"{server!r} is not HOST or HOST:PORT", param_hint="--plus-server")
+    host, port = server
     said = update_transform(
-        frames,
-        transform.plus_matrix(),
-        host,
-        int(text) if colon else PORT,
-        error_mm=transform.error_mm,
+        frames, transform.plus_matrix(), host, port, error_mm=transform.error_mm
     )
-    return f"{server}: {frames[0]} to {frames[1]} set; {said}"
+    return f"{host}:{port}: {frames[0]} to {frames[1]} set; {said}"

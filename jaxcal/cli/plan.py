@@ -31,8 +31,17 @@ _COUNTED = (0.5, 0.3, 0.2, 0.1)
 """Errors (mm) for which the images are counted, where none is asked for."""
 
 _PICTURES = (
-    *(b"\x89PNG", b"\xff\xd8\xff", b"GIF8", b"RIFF", b"II*", b"MM"),
-    *(b"%PDF", b"%!PS", b"%% Creator: Matplotlib", b"<?xml"),
+    b"\x89PNG",
+    b"\xff\xd8\xff",  # JPEG
+    b"GIF8",
+    b"RIFF",  # WebP
+    b"II*",  # TIFF, as the next
+    b"MM",
+    b"%PDF",
+    b"%!PS",
+    b"%% Creator: Matplotlib",  # PGF
+    b"<?xml",  # SVG
+    b"\x1f\x8b",  # SVG, compressed
 )
 """How files begin that matplotlib draws."""
 
@@ -180,7 +189,7 @@ def plan(
             )
         if figure is not None:
             _draw(found, until_tre, figure)
-        record = _record(found, recording)
+        record = _record(found, recording, candidates.constraints.region)
     if simulate:
         with progress("calibrating simulated recordings"):
             record["simulated"] = [
@@ -278,7 +287,7 @@ def _draw(found: Plan, wanted: float | None, path: str) -> None:
     save_figure(plan_figure(found, wanted), path)
 
 
-def _record(found: Plan, recording: str | None) -> dict[str, Any]:
+def _record(found: Plan, recording: str | None, region: Region) -> dict[str, Any]:
     from jaxcal.design import images_to
     from jaxcal.report.next_poses import pose_records
 
@@ -291,6 +300,7 @@ def _record(found: Plan, recording: str | None) -> dict[str, Any]:
     return {
         "source": recording,
         "criterion": found.criterion,
+        "region": {"depth_mm": list(region.depth_mm), "lateral_mm": list(region.lateral_mm)},
         "images_before": found.known.images,
         "tre_mm": found.tre_mm.tolist(),
         "rp_mm": found.rp_mm.tolist(),
@@ -321,10 +331,12 @@ def _print(found: Plan, record: dict[str, Any], figure: str | None) -> None:
         + ("over 1000" if count is None else "reached" if count <= there else f"{count}")
         for wanted, count in record["images_to_tre_mm"].items()
     ]
+    (near, far), (left, right) = (record["region"][k] for k in ("depth_mm", "lateral_mm"))
     before = "" if not there else f" after the {there} that there are"
     these = "this image" if len(found) == 1 else f"these {len(found)} images"
     print_page(
         table,
+        f"Target {near:.0f} to {far:.0f} mm deep, laterally from {left:.0f} to {right:.0f} mm.",
         "Tilts and turns from the middle orientation, with the marker to your right; left is where "
         "the lateral position is smallest. Take them in any order.",
         f"Predicted with {these}{before}: error over the image "

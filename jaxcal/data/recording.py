@@ -195,8 +195,7 @@ def make_images(
             "(dataclasses.replace(problem, measurements=...))"
         )
     try:
-        if kind not in get_args(Kind):
-            raise InputError(f"kind must be one of {', '.join(get_args(Kind))}, not {kind!r}")
+        check_kind(kind)
         poses, values = real_array(poses, "poses"), real_array(measurements, "measurements")
         count = len(poses) if poses.ndim else 0
         if values.ndim != 2:
@@ -215,7 +214,7 @@ def make_images(
         _check_magnitude("pose", poses, used)
         checked = check_poses(poses, used)
         values = used_values(kind, values, used)
-        spacing, face_mm = _spacing(spacing_mm, kind), _face_offset(face_offset_mm)
+        spacing, face_mm = check_spacing(spacing_mm, kind), _face_offset(face_offset_mm)
         if kind == "pixel":
             _check_below_face(values, spacing, face_mm, used)
 
@@ -289,7 +288,14 @@ def used_values(
     return values
 
 
-def _spacing(spacing_mm: Any, kind: Kind) -> Float[np.ndarray, 2] | None:
+def check_kind(kind: object) -> None:
+    """Refuse another kind of measurements than there are."""
+    if kind not in get_args(Kind):
+        raise InputError(f"kind must be one of {', '.join(get_args(Kind))}, not {shown(kind)}")
+
+
+def check_spacing(spacing_mm: Any, kind: Kind) -> Float[np.ndarray, 2] | None:
+    """[lateral, axial] mm/px as an array; only pixels have it."""
     if spacing_mm is None:
         return None
     spacing = real_array(spacing_mm, "spacing_mm")

@@ -290,7 +290,9 @@ def seen_region(recording: Recording, targets: Float[np.ndarray, "n 3"]) -> Regi
     left, right = targets[:, 0].min(), targets[:, 0].max()
     near, far = targets[:, 2].min(), targets[:, 2].max()
     aside, deeper = _WIDER * max(right - left, 20.0), _WIDER * max(far - near, 20.0)
-    lateral, depth = (left - aside, right + aside), (max(near - deeper, 5.0), far + deeper)
+    # Not nearer than 5 mm, unless the target was there.
+    nearest = max(near - deeper, min(max(near, 0.1), 5.0))
+    lateral, depth = (left - aside, right + aside), (nearest, far + deeper)
     if probe is not None:
         lateral = (min(left, whole.lateral_mm[0]), max(right, whole.lateral_mm[1]))
     depth = (min(depth), max(depth))

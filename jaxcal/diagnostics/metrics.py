@@ -30,8 +30,8 @@ def reconstruction_precision(
         sqrt(sum over x, y, z of the unbiased variance (n - 1)), mm.
 
     Raises:
-        InputError: shapes that do not agree, what are no numbers, or fewer than two images to
-            count.
+        InputError: shapes that do not agree, what are no numbers, a mask of other numbers than 0
+            and 1, or fewer than two images to count.
     """
     xp = array_module(image_to_probe, poses, points, mask)
     image_to_probe = _numbers(image_to_probe, "image_to_probe")
@@ -48,6 +48,8 @@ def reconstruction_precision(
             wanted = " or ".join(map(str, shapes))
             raise InputError(f"{name} must have shape {wanted}, not {np.shape(values)}")
     if mask is not None:
+        if not is_traced(mask) and not np.isin(mask, (0, 1)).all():
+            raise InputError("mask must hold ones (images to count) and zeros")
         poses = xp.where(mask[:, None, None] > 0, poses, 0.0)
         points = xp.where(mask[:, None] > 0, points, 0.0)
     cloud = reconstruct(image_to_probe, poses, points)

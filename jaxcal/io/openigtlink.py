@@ -37,6 +37,8 @@ from jaxcal.io.message_content import (
 from jaxcal.io.tracked_frame import decode_tracked_frame, encode_tracked_frame
 from jaxcal.runtime.array_types import Float
 
+PORT = 18944
+"""OpenIGTLink's registered port, and PlusServer's first."""
 HEADER_SIZE = 58
 RF_DEVICE = "RF"
 """Device name under which RF channel data are assumed to come."""

@@ -6,8 +6,8 @@ It comes from the covariance, which assumes that the noise model holds. If the d
 (:mod:`jaxcal.report.contradictions`), the expected error is larger, and the larger number is
 reported.
 
-The word of the verdict depends on this number: good up to 0.5 mm, fair up to 1.5 mm, otherwise
-uncertain.
+The word of the verdict depends on this number and on the upper end of its interval: good up to
+0.5 mm (at most 1.5 mm), fair up to 1.5 mm (at most 4.5 mm), otherwise uncertain.
 """
 
 from __future__ import annotations
@@ -53,6 +53,12 @@ GOOD_MM = 0.5
 """Largest error to expect at the image (root mean square) that is called good."""
 FAIR_MM = 1.5
 """Largest error that is called fair; larger ones are called uncertain."""
+WIDEST = 3.0
+"""Largest upper end of the interval for either word, as a multiple of the word's largest error.
+
+Of seven images or more it is at most 3.3 times the error itself; of four, with the conventional
+method, 29 times: such a number is no answer, however small it is.
+"""
 
 _ACROSS = 15
 """Number of points along each side of the map."""
@@ -307,9 +313,12 @@ def settle(record: dict[str, Any]) -> None:
     for point in tre["points"]:
         point["tre_mm"] = factor * point["stated_mm"]
         point["interval_95_mm"] = [factor * end for end in point["stated_interval_mm"]]
-    error = tre["rms_mm"]
-    word = "good" if error <= GOOD_MM else "fair" if error <= FAIR_MM else "uncertain"
-    record["verdict"] = None if record.get("wrong_frames") else word
+    if usable:
+        # Both ends count: few images tell hardly how large the error is.
+        error = max(tre["rms_mm"], tre["interval_95_mm"][1] / WIDEST)
+        record["verdict"] = (
+            "good" if error <= GOOD_MM else "fair" if error <= FAIR_MM else "uncertain"
+        )
 
 
 def stated_at(result: Calibration, points: Float[np.ndarray, "m 2"]) -> float | None:

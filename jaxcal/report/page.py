@@ -85,10 +85,10 @@ def check_page(path: str | os.PathLike[str], inputs: Sequence[str] = ()) -> None
     """Check that a page can be written, before other work begins.
 
     Raises:
-        InputError: the file is one of the inputs, or exists and is no page.
+        InputError: the file is one of the inputs, exists and is no page, or is not named .html.
         OutputError: it cannot be made or replaced.
     """
-    check_output(path, "a page of jaxcal", _is_page, inputs)
+    check_output(path, "a page of jaxcal", _is_page, inputs, endings=(".html", ".htm"))
     check_writable(path)
 
 

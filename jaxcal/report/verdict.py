@@ -10,7 +10,6 @@ import math
 from typing import Any
 
 from jaxcal.diagnostics.uncertainty import TUNED
-from jaxcal.report.accuracy import FAIR_MM
 from jaxcal.report.paragraphs import listed
 from jaxcal.report.resampled import resampled_sentences
 
@@ -305,8 +304,7 @@ def advice(record: dict[str, Any]) -> list[str]:
             "residuals), or add images; then calibrate again."
         )
     else:
-        tre = record.get("tre") or {}
-        if few or (tre.get("rms_mm") or math.inf) > FAIR_MM:
+        if few or record["verdict"] == "uncertain":
             advice.append(_addition(record))
     if status == "converged" and record["method"] == "conventional" and _out_of_plane(record):
         advice.append(

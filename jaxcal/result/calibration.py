@@ -469,7 +469,7 @@ class Calibration:
         """Write one page for a browser, as ``jaxcal calibrate --report`` does.
 
         Raises:
-            InputError: the file exists and is no such page.
+            InputError: the file exists and is no such page, or is not named .html.
             OutputError: it could not be written and is unchanged.
         """
         from jaxcal.report.page import write_page
