@@ -464,7 +464,7 @@ def test_limits_in_words(record):
     changed["next_poses"] = {"tre_now_mm": 0.4, "tre_then_mm": 0.3, "poses": [{}, {}, {}]}
     settle(changed)
     said = " ".join(limits(changed))
-    assert "targets out of the image plane (70 %) and range errors of the points (25 %)" in said
+    assert "targets out of the image plane (70 %), then range errors of the points (25 %)" in said
     assert "3 well-chosen images would help as much as 19 more" in said
 
 

@@ -341,7 +341,7 @@ def _print(found: Plan, record: dict[str, Any], figure: str | None) -> None:
         "the lateral position is smallest. Take them in any order.",
         f"Predicted with {these}{before}: error over the image "
         f"{found.tre_mm[-1]:.2g} mm, reconstruction precision {found.rp_mm[-1]:.2g} mm.",
-        *([f"Images needed: {'; '.join(counts)}."] if counts else []),
+        *([f"Images needed for an error of {'; '.join(counts)}."] if counts else []),
         *(_simulated_in_words(errors) for errors in record.get("simulated", ())),
         *([] if figure is None else [f"figure: {figure}"]),
     )

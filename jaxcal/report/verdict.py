@@ -136,7 +136,7 @@ def limits(record: dict[str, Any]) -> list[str]:
     if shares:
         ranked = sorted(shares.items(), key=lambda item: -item[1])
         named = [f"{_KINDS[kind]} ({100 * share:.0f} %)" for kind, share in ranked if share >= 0.1]
-        lines.append(f"The mean square error comes mainly from {' and '.join(named)}.")
+        lines.append(f"The mean square error comes mainly from {', then '.join(named)}.")
     poses = _poses(record)
     if poses:
         lines.append(poses)
@@ -257,8 +257,8 @@ def certainty(record: dict[str, Any]) -> list[str]:
     about = max(range(3), key=lambda axis: record["covariance"][3 + axis][3 + axis])
     lines = [
         f"The image's position on the probe has a standard deviation of {_mm(spread[0])}, "
-        f"largest along its {_AXES[along]} axis; its orientation, one of {spread[1]:.2f} degrees, "
-        f"largest about its {_AXES[about]} axis."
+        f"largest along its {_AXES[along]} axis. That of its orientation is {spread[1]:.2f} "
+        f"degrees, largest about its {_AXES[about]} axis."
     ]
     unseen = record["observability"]["known_only_from_prior"]
     if unseen and record["prior"] in TUNED:
