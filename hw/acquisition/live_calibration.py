@@ -34,7 +34,7 @@ MOST_IMAGES = 100_000
 
 
 class LiveCalibration:
-    """Images come in one by one; the calibration so far is there after each.
+    """Calibrate while images arrive: after each, the calibration from all images so far.
 
     Args:
         capacity: most images; twice the capacity takes twice the time of a solve.
@@ -45,7 +45,7 @@ class LiveCalibration:
 
     Raises:
         InputError: capacity that is no whole number from 4 to 100,000; another kind; a spacing that
-            cannot be; times of flight without a probe, or something else in its place.
+            is not plausible; times of flight without a probe, or something else in its place.
     """
 
     def __init__(

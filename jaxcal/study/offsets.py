@@ -12,7 +12,7 @@ Laws other than those that the prior ``auto`` weighs (the last is what it assume
 
     exponential   of SD s, and so of mean s: mostly near the plane, always on the same side
     two-humped    half of them near -m, half near m, each hump of SD m / 4
-    drifting      normal, of SD s, alike in successive images: correlation 0.9 from one to the next
+    drifting      normal, of SD s, correlated from one image to the next (0.9)
     outlying      normal, of SD s, one in ten drawn from a normal five times as wide
     off-centre    normal, of SD s, with a mean of 3 s
     sometimes off-centre  normal, of SD s, one time in ten with a mean that is normal, of SD 2 s
