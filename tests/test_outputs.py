@@ -264,7 +264,7 @@ def test_a_recording_is_named_so(folder, arguments, capsys):
 def test_an_extension_without_a_format(folder, name, capsys):
     (folder / name).write_text("<x/>")
     assert main(["export", name, "--plus"]) == 2
-    assert f"{name}: its extension tells no format (there are .json," in capsys.readouterr().err
+    assert f"{name}: its extension names no format (there are .json," in capsys.readouterr().err
     shutil.copy("cal.json", name)  # the JSON is understood without one
     assert main(["export", name, "--plus"]) == 0
 

@@ -53,7 +53,7 @@ def _format_of(name: str) -> SaveFormat:
         if name.lower().endswith(extensions):
             return chosen
     known = dict.fromkeys(each for extensions in _EXTENSIONS.values() for each in extensions)
-    raise FormatError(f"{name}: its extension tells no format (there are {', '.join(known)})")
+    raise FormatError(f"{name}: its extension names no format (there are {', '.join(known)})")
 
 
 def check_target(
@@ -76,7 +76,7 @@ def check_target(
     chosen = _format_of(name) if format is None else format
     extensions = _EXTENSIONS.get(chosen) if isinstance(chosen, str) else None
     if extensions is None:
-        raise InputError(f"{quoted(str(chosen))} is no format that is written")
+        raise InputError(f"{quoted(str(chosen))} is not a format that can be written")
     check_output(
         path,
         f"a calibration (format {chosen})",
@@ -176,7 +176,7 @@ def text_of(transform: ImageTransform, format: SaveFormat, *, frames: FramePair)
         return calib_matrix(rigid, scale)
     if format == "numpy":
         return np.array2string(transform.plus_matrix(), separator=", ", floatmode="unique") + "\n"
-    raise InputError(f"{quoted(str(format))} is no format that is written")
+    raise InputError(f"{quoted(str(format))} is not a format that can be written")
 
 
 def left_out(transform: ImageTransform, format: SaveFormat) -> str | None:

@@ -98,7 +98,7 @@ def run_study(
             f"run_study takes a study, not {shown(spec)}: jaxcal.study.load_spec(path) reads one"
         )
     if whole_number("workers", workers, 0, _MOST_WORKERS) and scheduler is not None:
-        raise InputError("workers must not be given beside a scheduler")
+        raise InputError("workers must not be given together with a scheduler")
     check_flag("resume", resume)
     watcher = Silence() if watcher is None else watcher
     if not isinstance(watcher, Watcher):
