@@ -31,8 +31,8 @@ SEED = 20261124
 LAWS: tuple[OffsetLaw, ...] = ("uniform", "normal", "heavy-tailed")
 FAULTS = ("none", "three images", "drift")
 KINDS = {
-    "heavier tails": "tails", "lean to one side": "one side", "grow with depth": "depth",
-    "alike in successive": "alike", "drift in the course": "drift",
+    "heavier tails": "tails", "skewed to one side": "one side", "grow with depth": "depth",
+    "correlated in successive": "alike", "drift in the course": "drift",
 }  # fmt: skip
 HEADER = [
     "elevation_distribution", "images", "fault", "trials", "suspects", "outliers", "fault_named",

@@ -383,16 +383,16 @@ def test_verdict_falls_when_the_covariance_is_contradicted(record, kind):
     )
     lines = verdict(changed)
     assert f"{tre['rms_mm']:.2f} mm" in lines[0]
-    assert "The noise model by itself states 0.40 mm, but " in lines[1]
+    assert "By the noise model alone the error would be 0.40 mm, but " in lines[1]
     # Neither poses nor a number of images are promised to remove what contradicts the model.
     changed["rms_mm"] = 0.45
     said = " ".join(verdict(changed))
-    assert "what is missing are other poses" not in said
-    assert said.index("First of all what contradicts") < said.index("make its mean square error")
+    assert "add other poses" not in said
+    assert said.index("Most of all, what contradicts") < said.index("mean square error comes")
     changed["next_poses"] = {
         "tre_now_mm": 0.4, "tre_then_mm": 0.3, "poses": [{"words": "tilt"}], "images_to_half": 5,
     }  # fmt: skip
-    assert "may stay" in next_poses_sentences(changed)[-1]
+    assert "may remain" in next_poses_sentences(changed)[-1]
     # Said once, whatever is found out later.
     again = copy.deepcopy(changed)
     settle(again)
@@ -464,8 +464,8 @@ def test_limits_in_words(record):
     changed["next_poses"] = {"tre_now_mm": 0.4, "tre_then_mm": 0.3, "poses": [{}, {}, {}]}
     settle(changed)
     said = " ".join(limits(changed))
-    assert "Targets out of the image plane (70 %), then errors of their depth (25 %)" in said
-    assert "3 well chosen images help as much as 19 more" in said
+    assert "targets out of the image plane (70 %) and range errors of the points (25 %)" in said
+    assert "3 well-chosen images would help as much as 19 more" in said
 
 
 def test_why_larger_residuals_are_believed(record):
@@ -474,8 +474,8 @@ def test_why_larger_residuals_are_believed(record):
         "log_density_gain": 20.6, "log_density_gain_sd": 5.5, "apart_mm": 0.43,
     }  # fmt: skip
     said = " ".join(verdict({**record, "comparison": beside}))
-    assert "larger than those of the conventional fit (1.010 and 0.980 mm)" in said
-    assert "0.44 mm off, these weights 0.41 mm" in said
+    assert "larger than that of the conventional fit (1.010 against 0.980 mm)" in said
+    assert "an expected error of 0.44 mm, one with weights from these sizes 0.41 mm" in said
     assert "log density +20.6 +- 5.5" in said
 
 

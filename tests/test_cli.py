@@ -827,7 +827,7 @@ def test_a_figure_of_a_plan_is_known_as_a_picture_and_may_be_replaced(tmp_path, 
 def test_plan_from_nothing_is_words_and_counts(capfd):
     out = told(capfd, "plan", "--images", 6, "--cone", 20, "--seed", 1)
     assert "tilt 20 degrees" in out
-    assert "How many images an error takes" in out
+    assert "Images needed" in out
     assert out.count("target") >= 6
 
 

@@ -163,7 +163,7 @@ def test_where_nothing_is_credible_the_way_on_is_named(tmp_path, capsys):
         (["--method", "shortest"], "--method is an option for times of flight"),
         (["--no-robust"], "is an option for times of flight"),
         (["--region", "140", "0", "40", "40"], "leaves the 150 x 110 px frame"),
-        (["--out", "f.igs.mha"], "is read by this command"),
+        (["--out", "f.igs.mha"], "is an input of this command"),
         (["--from", "Stylus"], "no transforms lead from 'Stylus'"),
     ],
 )
@@ -523,7 +523,10 @@ def test_dates_are_not_matched_with_seconds(tmp_path, what, capsys):
 @pytest.mark.parametrize(
     ("times", "message"),
     [
-        (MOMENTS + 1778070000, r"poses from 1778070100.000 s to 1778070103.980 s: .* one clock\?"),
+        (
+            MOMENTS + 1778070000,
+            r"poses from 1778070100.000 s to 1778070103.980 s: .* the same clock\?",
+        ),
         (MOMENTS[::-1], "is before the one before it"),
         (np.full(200, np.nan), "states no times"),
         (np.full(200, 101.0), "one time stamp"),
@@ -662,7 +665,7 @@ def test_lags_that_cannot_be_estimated(tmp_path, lagging, folder, capsys):
         assert message in error
         assert error.count("\n") == 1
     assert main(["pick", images, "--skip-invalid"]) == 2
-    assert "--skip-invalid is for tables, and none is read" in capsys.readouterr().err
+    assert "--skip-invalid is for tables, but no table is read" in capsys.readouterr().err
     assert main(["pick", images, "--poses", tracking, "--lag", "auto"]) == 2
     assert "it is an option of jaxcal import" in capsys.readouterr().err
     assert not (tmp_path / "o.h5").exists()

@@ -764,7 +764,7 @@ def test_inflating_chunk(path):
     with h5py.File(path, "r+") as file:
         dataset = put(file["calibration"], "time", (COUNT,), "f8", chunks=(6,), compression="gzip")
         dataset.id.write_direct_chunk((0,), bomb)
-    refused(path, "packed chunk larger than its contents")
+    refused(path, "compressed chunk larger than its contents")
     with h5py.File(path, "r+") as file:
         dataset = put(
             file["calibration"], "time", (COUNT,), "f8", chunks=(50_000,), maxshape=(None,),
@@ -779,8 +779,8 @@ def test_inflating_chunk(path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"compression": "lzf"}, r"packed by filter 32000 \('lzf'\), which is not read"),
-        ({"scaleoffset": 3}, "packed by filter 6 .*, which is not read"),
+        ({"compression": "lzf"}, r"compressed by filter 32000 \('lzf'\), which is not read"),
+        ({"scaleoffset": 3}, "compressed by filter 6 .*, which is not read"),
         ({"compression": 32015, "allow_unknown_filter": True}, "filter 32015 "),
     ],
 )
@@ -806,8 +806,8 @@ def create_with_filters(group, name, codes):
 def test_filters_repeated_or_in_another_order(path):
     deflate, shuffle = h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE
     for codes, message in (
-        ((deflate, deflate), "packed twice by the same filter"),
-        ((deflate, shuffle), "in an order that is not read"),
+        ((deflate, deflate), "compressed twice by the same filter"),
+        ((deflate, shuffle), "in an order that is not supported"),
     ):
         with h5py.File(path, "r+") as file:
             if "time" in file["calibration"]:

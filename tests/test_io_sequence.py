@@ -208,7 +208,7 @@ def test_pixels_beside_as_metaio_reads_them(tmp_path, line, how):
         (
             b"HeaderSize = -1",
             {"before": b"x", "compressed": True},
-            "state where the packed ones begin",
+            "state where the compressed ones begin",
         ),
         (b"HeaderSize = -2", {}, "HeaderSize must be whole numbers, not '-2'"),
         (b"HeaderSize = 1 2", {}, "HeaderSize must be one number, not '1 2'"),
@@ -239,7 +239,7 @@ def test_more_pixels_than_claimed(tmp_path, name):
     if name.endswith(".mha"):
         (tmp_path / name).write_bytes(content)
         edit(tmp_path / name, b"(ElementDataFile)", rb"HeaderSize = 9\n\1")
-        with pytest.raises(FormatError, match="HeaderSize = '9': is read only for pixels in"):
+        with pytest.raises(FormatError, match="HeaderSize = '9': applies only to pixels in"):
             read_sequence(tmp_path / name)
 
 
@@ -330,7 +330,7 @@ FIRST_NUMBER = rb"(Seq_Frame0001_\w+Transform = )\S+ "
         (rb"DimSize = 4 6 5", b"", "DimSize or ElementDataFile is missing"),
         (rb"Seq_Frame0001_", b"Seq_Frame_", "does not name a frame and a field"),
         (rb"Seq_Frame0001_", b"Seq_Frame4294967296_", "frame 4294967296; at most"),
-        (rb"Seq_Frame0001_", b"Seq_Frame0000_", "stands there twice"),
+        (rb"Seq_Frame0001_", b"Seq_Frame0000_", "is given twice"),
         (FIRST_NUMBER, rb"\1", "line 24: a transform has 16 numbers, not 15"),
         (FIRST_NUMBER, rb"\1nan ", "line 24: a transform with status OK holds NaN"),
         (FIRST_NUMBER, rb"\1x ", "are not numbers"),
@@ -419,7 +419,7 @@ def test_damaged_and_truncated_pixels(tmp_path):
     content = (tmp_path / "a.mha").read_bytes()
     for cut in (-1, -40):
         (tmp_path / "a.mha").write_bytes(content[:cut])
-        with pytest.raises(FormatError, match=r"the pixels end at|claims|end is missing"):
+        with pytest.raises(FormatError, match=r"the pixels end at|claims|data is missing"):
             list(read_sequence(tmp_path / "a.mha").images())
     (tmp_path / "a.mha").write_bytes(content[:-60] + bytes(60))
     with pytest.raises(FormatError, match=r"damaged|end at"):

@@ -129,7 +129,7 @@ def test_a_narrow_cone_is_weak_but_solved():
 
 def test_what_only_the_bound_fixes_is_said():
     data = problem(3, images=12, elevation_mm=0.5, noise_mm=0.2)
-    for bound, held in ((10.0, "interval"), (0.2, "rest on it")):
+    for bound, held in ((10.0, "interval"), (0.2, "images are at the bound")):
         result = jaxcal.calibrate(data, prior="bounded", max_elevation=np.full(12, bound))
         about = [w for w in result.warnings if "nothing but the bound" in w]
         assert len(about) == 1

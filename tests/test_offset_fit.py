@@ -45,14 +45,14 @@ def test_many_offsets_tell_the_laws_apart():
 def test_words_never_name_a_law_that_the_offsets_contradict():
     said = _law_in_words({"gaussian": 1.0, "uniform": 0.0, "bell": 0.0, "student": 0.0},
                                   ["gaussian", "bell", "student"])  # fmt: skip
-    assert "look uniform between edges" in said
-    assert said.startswith("The estimate rests on offsets that are Gaussian (100 %), but")
+    assert "look uniform with sharp limits" in said
+    assert said.startswith("The estimate assumes offsets that are Gaussian (100 %), but")
     none = _law_in_words({"gaussian": 1.0, "uniform": 0.0}, list(FAMILIES))
-    assert none.startswith("None of the laws that were compared fits the offsets")
+    assert none.startswith("None of the distributions compared fits the offsets")
     fine = _law_in_words({"gaussian": 0.2, "uniform": 0.8}, ["student"])
     assert fine == (
-        "Of the laws that were compared, the data prefer offsets that are uniform between edges "
-        "(80 %) or Gaussian (20 %)"
+        "Of the distributions of the offsets that were compared, the data prefer: uniform with "
+        "sharp limits (80 %) or Gaussian (20 %)"
     )
 
 
@@ -63,8 +63,6 @@ def test_five_thousand_uniform_offsets_are_not_called_gaussian():
     law = offset_law(result.numpy())
     assert law is not None
     words = str(law["words"])
-    assert "uniform between edges" in words
+    assert "uniform with sharp limits" in words
     assert "gaussian" in law["contradicted"]
-    assert not words.startswith(
-        "Of the laws that were compared, the data prefer offsets that are G"
-    )
+    assert "the data prefer: G" not in words

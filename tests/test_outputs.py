@@ -224,7 +224,7 @@ def test_saved_from_python(folder):
 
 def test_links_and_what_is_no_file(folder, tmp_path):
     (tmp_path / "link").hardlink_to(tmp_path / "points.txt")
-    with pytest.raises(InputError, match="is read by this command"):
+    with pytest.raises(InputError, match="is an input of this command"):
         check_output("link", "a table", begins_with(b"u,v"), ["points.txt"])
     check_output("link", "a table", begins_with(b"u,v"), ["rec.h5", "nowhere"])
     write_text("empty", "")

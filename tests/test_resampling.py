@@ -133,4 +133,4 @@ def test_command_line_shows_both(tmp_path, capsys):
     # A line may end at a hyphen.
     page = " ".join(capsys.readouterr().out.split()).replace("- ", "-")
     assert "20-fold cross-validation" in page
-    assert "Calibrated 20 times from images drawn anew" in page
+    assert "In 20 bootstrap calibrations" in page

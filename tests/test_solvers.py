@@ -75,7 +75,7 @@ def test_recovers_the_truth_from_exact_data(solver):
     assert result.status == "converged"
     if result.prior == "bounded":
         # Exact data rest on no bound, so nothing but the bound confines some direction.
-        assert "fixed by nothing but the bound" in result.warnings[0]
+        assert "determined by nothing but the bound" in result.warnings[0]
     precision = 1e-7 if solver.agreement < 1e-5 else 1e-3
     assert angle(result.image_to_probe, truth.image_to_probe) < precision / 50
     np.testing.assert_allclose(result.image_to_probe, truth.image_to_probe, atol=precision)

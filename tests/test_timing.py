@@ -188,7 +188,7 @@ def test_motion_signal_of_poses() -> None:
         (lambda t: 0 * t, motion, "show no motion"),
         (lambda t: np.random.default_rng(1).normal(size=len(t)), motion, "same motion"),
         (lambda t: motion(t - 0.53), motion, "larger ones"),
-        (lambda t: 20 * np.sin(20 * t), lambda t: 20 * np.sin(20 * t), "fit alike"),
+        (lambda t: 20 * np.sin(20 * t), lambda t: 20 * np.sin(20 * t), "fit equally well"),
         (lambda t: np.where(t > 5, np.nan, t), motion, "NaN"),
     ],
 )

@@ -329,7 +329,7 @@ def test_itk_files_by_itk(tmp_path, extension):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (itk_text(np.eye(4)).replace("#Insight", "#Outsight"), "its first line is another"),
+        (itk_text(np.eye(4)).replace("#Insight", "#Outsight"), "its first line does not say so"),
         (itk_text(np.eye(4)).replace(" 1.0 ", " nan "), "holds NaN"),
         (itk_text(np.eye(4)).replace(" 1.0 ", " ", 1), "with 11 parameters is not read"),
         (itk_text(np.eye(4)).replace(" 1.0 ", " 0.0 "), "is singular"),
@@ -618,7 +618,7 @@ def test_apply_refuses_options_of_a_table_where_none_is_read(saved, tmp_path, ca
     rest = ["--pose-units", "m", "--quaternion", "wxyz", "--skip-invalid"]
     for source in (["--pixel", "1", "2"], [str(tmp_path / "rec.h5")]):
         assert main(["apply", str(saved), *source, *rest]) == 2
-        told = "--quaternion, --pose-units, --skip-invalid: for tables, and none is read"
+        told = "--quaternion, --pose-units, --skip-invalid: for tables, but no table is read"
         assert told in capsys.readouterr().err
 
 
@@ -627,7 +627,7 @@ def test_apply_refuses_options_of_poses_where_a_table_has_none(saved, tmp_path, 
     uv.write_text("u,v\n1,2\n")
     for given in (["--quaternion", "wxyz"], ["--pose-units", "m"]):
         assert main(["apply", str(saved), str(uv), *given]) == 2
-        assert f"{given[0]}: for poses, and {uv} holds none" in capsys.readouterr().err
+        assert f"{given[0]}: for poses, but {uv} holds none" in capsys.readouterr().err
     assert main(["apply", str(saved), str(uv), "--skip-invalid"]) == 0
 
 

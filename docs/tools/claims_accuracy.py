@@ -37,20 +37,18 @@ from claims import (
 
 claim(
     README,
-    "| error against conventional calibration, on average, in {} conditions | {:.2f} to {:.2f} of "
-    "it |",
+    "| mean error, relative to conventional calibration, in {} conditions | {:.2f} to {:.2f} |",
     lambda: (len(auto()), *span(auto())),
 )
 claim(
     README,
-    "| error against the best possible (the Bayes limit), median of {} conditions | "
-    "{:.2f} times it |",
+    "| mean error, relative to the best possible (the Bayes limit), median of {} conditions | "
+    "{:.2f} |",
     lambda: (len(bayes("50")), statistics.median(bayes("50"))),
 )
 claim(
     README,
-    "| 95 % intervals that cover the truth, each of 6 parameters in {} conditions | "
-    "{:.1f} to {:.1f} % |",
+    "| coverage of 95 % intervals, for 6 parameters in {} conditions | {:.1f} to {:.1f} % |",
     lambda: (len(table("coverage")), *covered()),
 )
 claim(
@@ -63,11 +61,11 @@ claim(
     "| {:.2f} times the Bayes limit's error (median of {} conditions), {:.2f} at worst |",
     lambda: (statistics.median(bayes("50")), len(bayes("50")), max(bayes("50"))),
 )
-claim(INDEX, "95 % intervals cover in {:.1f} to {:.1f} % |", covered)
+claim(INDEX, "95 % intervals cover the truth in {:.1f} to {:.1f} % |", covered)
 claim(
     INDEX,
-    "95 % intervals of TRE hold in {:.1f} to {:.1f} % for offsets of mean zero; the predicted TRE "
-    "is {:.2f} to {:.2f} times the actual one |",
+    "95 % intervals of TRE contain the actual one in {:.1f} to {:.1f} % for offsets of mean zero; "
+    "the predicted TRE is {:.2f} to {:.2f} times the actual one |",
     lambda: (*percent(tre_span("held_at_points")), *tre_span("predicted_over_actual")),
 )
 claim(
@@ -82,7 +80,7 @@ claim(
 )
 claim(
     INDEX,
-    "| never above in {:.0f} problems |",
+    "| joint never higher in {:.0f} problems |",
     lambda: [quantity("same_objective_summary", "problems")],
 )
 claim(
@@ -92,7 +90,7 @@ claim(
 )
 claim(
     INDEX,
-    "| precision within {:.0f} % of knowing both |",
+    "| precision within {:.0f} % of that with both known |",
     lambda: [100 * max(abs(v - 1) for v in column("sound_speed_delay", "rp_estimated_over_known"))],
 )
 claim(
@@ -109,16 +107,16 @@ claim(
 # Accuracy.
 claim(
     ACCURACY,
-    "Over conventional's, at worst {:.2f} for uniform offsets, {:.2f} for normal, {:.2f} for "
-    "one-sided, {:.2f} for heavy-tailed and {:.2f} for triangular ones.",
+    "Ratio to conventional calibration: at worst {:.2f} for uniform offsets, {:.2f} for normal, "
+    "{:.2f} for one-sided, {:.2f} for heavy-tailed and {:.2f} for triangular ones.",
     lambda: [
         max(column("auto_grid", AUTO, elevation_distribution=law, images="50")) for law in LAWS
     ],
 )
 claim(
     ACCURACY,
-    "With 12, 20 and 200 images at worst {:.2f}, {:.2f} and {:.2f}. So it is above 1 in none of "
-    "{} cells. From points without covariances: at worst {:.2f}.",
+    "With 12, 20 and 200 images: at worst {:.2f}, {:.2f} and {:.2f}. So the ratio is above 1 in "
+    "none of {} cells. For points without covariances: at worst {:.2f}.",
     lambda: (
         *(max(column("auto_grid", AUTO, images=images)) for images in ("12", "20", "200")),
         len(auto()),
@@ -129,8 +127,8 @@ claim(
 
 claim(
     ACCURACY,
-    "is better in no cell: auto's error over the alternation's is at worst {:.2f}. From points "
-    "without covariances: at worst {:.2f}.",
+    "is better in no cell: the ratio of auto's error to the alternation's is at worst {:.2f}, and "
+    "{:.2f} for points without covariances.",
     lambda: [
         max(column("auto_grid", f"{name}_over_alternating")) for name in ("auto", "auto_points")
     ],
@@ -144,7 +142,7 @@ def _hindsight() -> list[object]:
 
 claim(
     ACCURACY,
-    "is ahead in {} of {} cells, at best by a factor of {:.2f}:",
+    "is better in {} of {} cells, at best by a factor of {:.2f}:",
     _hindsight,
 )
 
@@ -158,8 +156,8 @@ def _loses() -> list[float]:
 claim(ACCURACY, "in {:.0f} % of the trials of the worst cell.", _loses)
 claim(
     ACCURACY,
-    "Over conventional's {:.2f} to {:.2f}; the three estimated SDs are {:.3f} to {:.3f} of what "
-    "was realised.",
+    "Ratio to conventional calibration: {:.2f} to {:.2f}; the three estimated SDs are {:.3f} to "
+    "{:.3f} times those of the errors that were drawn.",
     lambda: (
         *span(column("self_tuned_grid", "joint_over_conventional")),
         *span(
@@ -183,8 +181,8 @@ claim(
 )
 claim(
     ACCURACY,
-    "auto's mean error is {:.2f} times the limit's in the median, {:.2f} at worst. With 12 images "
-    "{:.2f} to {:.2f}, with 20 images {:.2f} to {:.2f}.",
+    "auto's mean error is {:.2f} times the limit in the median, {:.2f} times at worst. With 12 "
+    "images {:.2f} to {:.2f}, with 20 images {:.2f} to {:.2f}.",
     lambda: (
         statistics.median(bayes("50")),
         max(bayes("50")),
@@ -194,8 +192,8 @@ claim(
 )
 claim(
     ACCURACY,
-    "with exact data, {} cells of {} are above 1.20. On 1000 draws of their own they are at "
-    "{:.2f} to {:.2f}:",
+    "with exact data, {} cells of {} are above 1.20. With 1000 new draws they are at {:.2f} to "
+    "{:.2f}:",
     lambda: (
         sum(v > 1.2 for v in bayes("50")),
         len(bayes("50")),
@@ -230,13 +228,13 @@ claim(
 )
 claim(
     ACCURACY,
-    "the 95 % interval of TRE at an image point holds the actual one in {:.1f} to {:.1f} %. The "
+    "the 95 % interval of TRE at an image point contains the actual one in {:.1f} to {:.1f} %. The "
     "predicted TRE is {:.2f} to {:.2f} times the actual one:",
     lambda: (*percent(tre_span("held_at_points")), *tre_span("predicted_over_actual")),
 )
 claim(
     ACCURACY,
-    "One-sided offsets of 5 mm: {:.1f} %; of 1.5 mm: {:.1f} %,",
+    "For one-sided offsets of 5 mm it is {:.1f} %; for those of 1.5 mm only {:.1f} %,",
     lambda: percent(
         [
             only("tre_calibration", "held_at_points", **ONE_SIDED, elevation_mm=size)
@@ -247,7 +245,7 @@ claim(
 claim(
     ACCURACY,
     "The error is at worst {:.2f} +- {:.2f} times that of the same images without the spoilt "
-    "ones. At least {:.1f} % of these are named, and at most {:.1f} % of the clean images. Of "
+    "ones. At least {:.1f} % of these are named, and at most {:.1f} % of the clean images. For "
     "clean data it is {:.2f} to {:.2f} times.",
     lambda: (
         number(worst_spoilt(), "robust_over_oracle"),
@@ -259,7 +257,7 @@ claim(
 )
 claim(
     ACCURACY,
-    "slipped together, {} of {} trials take them for noise, and these two dominate the mean "
+    "slipped together, {} of {} trials fail to recognise them, and these two dominate the mean "
     "({:.2f} +- {:.2f}).",
     lambda: (
         worst_spoilt("slip")["trials_with_one_left_in"],
@@ -284,7 +282,7 @@ claim(
 )
 claim(
     ACCURACY,
-    "the two methods are alike: {:.2f} mm (conventional) and {:.2f} mm.",
+    "the two methods perform alike: {:.2f} mm (conventional) and {:.2f} mm.",
     lambda: _crosswire("held_out_rms_conventional_mm", "held_out_rms_joint_mm"),
 )
 claim(
@@ -311,14 +309,14 @@ claim(
 )
 claim(
     ACCURACY,
-    "mean of the offsets (probability {:.2f}), since the residuals are heavy-tailed and alike in "
-    "successive images: {:.2f} of their information",
+    "mean of the offsets (probability {:.2f}), because the residuals are heavy-tailed and "
+    "correlated in successive images: {:.2f} of their information",
     lambda: _crosswire("mean_probability", "mean_trust"),
 )
 claim(
     ACCURACY,
-    "({:.0f} of {:.0f}) and fits to {:.3f} mm; its clean twin to {:.3f} mm. The two tips differ by "
-    "{:.2f} mm.",
+    "({:.0f} of {:.0f}) are left out, and the rest fit to {:.3f} mm; its clean counterpart fits "
+    "to {:.3f} mm. The two tips differ by {:.2f} mm.",
     lambda: _crosswire(
         "pivot_outliers_named",
         "pivot_outliers_poses",
@@ -329,9 +327,9 @@ claim(
 )
 claim(
     ACCURACY,
-    "Joint calibration, {:.3f} mm with the amplitude scan, {:.3f} mm with pattern injection, "
-    "{:.3f} mm with the threshold climb, {:.3f} mm with a steady free hand. Without placement "
-    "{:.2f} mm (by hand) and {:.2f} mm (by robot,",
+    "Joint calibration reaches {:.3f} mm with the amplitude scan, {:.3f} mm with pattern "
+    "injection, {:.3f} mm with the threshold climb, {:.3f} mm with a steady free hand. Without "
+    "placement {:.2f} mm (by hand) and {:.2f} mm (by robot,",
     lambda: [
         placed(name)
         for name in (

@@ -21,9 +21,9 @@ from claims import (
 
 for words, protocol in (
     ("| fitted: test images over 0.55 of the field, 2 rounds ", FITTED),
-    ("| default of `jaxcal.Protocol`: 0.75, until X rests ", "default: test 0.75, at rest"),
+    ("| default of `jaxcal.Protocol`: 0.75, until X converges ", "default: test 0.75, at rest"),
     ("| the whole field, 2 rounds ", "test 1.0, 2 rounds"),
-    ("| unfitted: the whole field, until X rests ", "unfitted: test 1.0, at rest"),
+    ("| unfitted: the whole field, until X converges ", "unfitted: test 1.0, at rest"),
 ):
     claim(PAPER, words + 3 * "| {} of {} " + "|", lambda protocol=protocol: cells(protocol))
 claim(
@@ -79,8 +79,8 @@ def _same(*names: str) -> list[float]:
 
 claim(
     PAPER,
-    "{:.0f} problems, the alternation run to 1e-10 or 20,000 rounds. The joint bounded solve is "
-    "above the alternation's objective in {:.0f} and below in {:.0f};",
+    "{:.0f} problems, the alternation run to 1e-10 or 20,000 rounds. The objective of the joint "
+    "bounded solve is above the alternation's in {:.0f} and below it in {:.0f};",
     lambda: _same(
         "problems",
         "joint objective above alternation's x (1 + 1e-8) + 1e-12 sum r^2",
@@ -89,8 +89,8 @@ claim(
 )
 claim(
     PAPER,
-    "its scaled KKT residual is at most {:.1e}. scipy's bounded trust region finds a lower one in "
-    "{:.0f} of {:.0f}. The joint solve's median is {:.0f} iterations,",
+    "its scaled KKT residual is at most {:.1e}. scipy's bounded trust-region solver finds a lower "
+    "objective in {:.0f} of {:.0f}. The joint solve takes a median of {:.0f} iterations,",
     lambda: _same(
         "joint scaled KKT residual, largest",
         "scipy trf: problems where it found a lower objective",
@@ -100,8 +100,8 @@ claim(
 )
 claim(
     PAPER,
-    "The alternation takes {:.0f} rounds (median) to the same objective where it gets there; "
-    "{:.0f} problems do not get there in 20,000.",
+    "The alternation takes {:.0f} rounds (median) to reach the same objective; in {:.0f} problems "
+    "it does not reach it in 20,000.",
     lambda: (
         *_same("alternation rounds to the joint's objective, median where reached"),
         quantity("same_objective_summary", "problems")

@@ -20,9 +20,9 @@ def _throughput(peer: str) -> float:
 
 claim(
     SPEED,
-    "That is {:.0f} times as many as numpy with scipy at its best (exact Jacobians, MINPACK), "
-    "{:.0f} times as many as with scipy's defaults, and {:.0f} times where scipy segments as well. "
-    "A whole trial of the joint method takes {:.2f} times",
+    "That is {:.0f} times as many as with numpy and scipy at its best (exact Jacobians, MINPACK), "
+    "{:.0f} times as many as with scipy's defaults, and {:.0f} times as many if scipy segments as "
+    "well. A whole trial of the joint method takes {:.2f} times",
     lambda: (
         *(_throughput(peer) for peer in ("best", "usual", "plain")),
         trials(
@@ -45,7 +45,7 @@ claim(
 )
 claim(
     SPEED,
-    "{:.0f} to {:.0f} MiB at most; within the largest, first and last quarter differ by "
+    "{:.0f} to {:.0f} MiB at most; in the largest study, the first and the last quarter differ by "
     "{:.1f} MiB.",
     _memory,
 )
@@ -121,7 +121,7 @@ claim(
 )
 claim(
     SPEED,
-    "Ceres takes {:.1f} times as long as all of ours (TinySolver: {:.1f}).",
+    "Ceres takes {:.1f} times as long as all of `calibrate_batch` (TinySolver: {:.1f}).",
     lambda: (
         _over("Ceres DENSE_SCHUR, 1e-9, from the conventional fit", FITTED),
         _over("Ceres TinySolver, 1e-9, from the conventional fit", FITTED),
@@ -150,7 +150,7 @@ claim(
 )
 claim(
     SPEED,
-    "The answers are the same but for {:.0e} mm.",
+    "The results agree to {:.0e} mm.",
     lambda: [max(column("accelerator", "largest_apart_mm"))],
 )
 claim(

@@ -18,9 +18,9 @@ claim(
 claim(ACCURACY, "and the five distributions with 8 images; {} cells.", lambda: [len(further())])
 claim(
     ACCURACY,
-    "Over conventional's, at worst {:.2f}. From points without covariances {:.2f} in one of them; "
-    "on 4000 draws of their own the {} cells in which any ratio was above 1 are at {:.2f} to "
-    "{:.2f}.",
+    "Ratio to conventional calibration: at worst {:.2f}. For points without covariances it is "
+    "{:.2f} in one of them; with 4000 new draws, the {} cells in which any ratio was above 1 are "
+    "at {:.2f} to {:.2f}.",
     lambda: (
         max(column("further_laws", "auto_over_conventional")),
         max(column("further_laws", "auto_points_over_conventional")),
@@ -42,8 +42,8 @@ def _worst_again() -> Row:
 POINTS = "auto_points_over_alternating"
 claim(
     ACCURACY,
-    "Over the alternation, at worst {:.2f}; from points without covariances {:.2f} +- {:.2f} (4000 "
-    "draws): two-humped offsets of 1 mm and 8 images,",
+    "Ratio to the alternation: at worst {:.2f}; for points without covariances {:.2f} +- {:.2f} "
+    "(4000 draws): two-humped offsets of 1 mm and 8 images,",
     lambda: (
         max(column("further_laws_again", "auto_over_alternating")),
         number(_worst_again(), POINTS),
@@ -55,7 +55,7 @@ claim(
 claim(
     ACCURACY,
     "the predicted TRE is {:.2f} (1.5 mm) and {:.2f} (5 mm) times the actual one, and the "
-    "intervals hold in {:.1f} and {:.1f} %.",
+    "intervals contain it in {:.1f} and {:.1f} %.",
     lambda: (
         *(_mixture("predicted_over_actual")),
         *percent(_mixture("held_at_points")),
@@ -74,9 +74,9 @@ def _scales(of: str, method: str, prior: str) -> tuple[float, float]:
 
 claim(
     ACCURACY,
-    "predicted over actual {:.2f} to {:.2f} for conventional calibration, {:.2f} to {:.2f} for the "
-    "Gaussian joint one, and {:.2f} to {:.2f} for `auto`, for the same reason. Its intervals hold "
-    "in {:.1f} to {:.1f} %.",
+    "the ratio of predicted to actual TRE is {:.2f} to {:.2f} for conventional calibration, "
+    "{:.2f} to {:.2f} for the Gaussian joint one, and {:.2f} to {:.2f} for `auto`, for the same "
+    "reason. Its intervals contain the actual TRE in {:.1f} to {:.1f} %.",
     lambda: (
         *_scales("predicted_over_actual", "conventional", "auto"),
         *_scales("predicted_over_actual", "joint", "gaussian"),
@@ -109,7 +109,7 @@ claim(
 )
 claim(
     ACCURACY,
-    "X moves by at most {:.2f} SD between such places. Where the offsets get a mean, and where one "
+    "X moves by at most {:.2f} SD between such points. If the offsets acquire a mean, or one "
     "image moves away by 3 mm, {:.0f} of {:.0f} paths of 30 images has a step",
     lambda: (
         max(_jumps("largest_step_sds", "own covariances")),
@@ -119,7 +119,7 @@ claim(
 )
 claim(
     ACCURACY,
-    "with 12 images it is {:.0f} and {:.0f} paths,",
+    "with 12 images {:.0f} and {:.0f} paths have such a step,",
     lambda: (_jumps("paths_above_a_tenth", path)[0] for path in ("mean", "outlier")),
 )
 claim(
@@ -221,7 +221,7 @@ def _left_out(of: str, *images: str) -> tuple[float, float]:
 
 claim(
     ACCURACY,
-    "clean recordings {:.1f} to {:.1f} % are told that an error is left out.",
+    "clean recordings {:.1f} to {:.1f} % are reported to have such an error.",
     lambda: span(percent(column("unmodelled", "told_of", fault="none"))),
 )
 claim(
@@ -275,8 +275,8 @@ def _foreseen(of: str, *laws: str) -> tuple[float, float]:
 claim(
     ACCURACY,
     "predicts a TRE that is {:.2f} to {:.2f} times the actual one of `auto`, in {:.0f} cells of "
-    "{:.0f} recordings: five laws, planned and random poses, both limits of tilt, {:.0f} to {:.0f} "
-    "images",
+    "{:.0f} recordings: five distributions, planned and random poses, both limits of tilt, {:.0f} "
+    "to {:.0f} images",
     lambda: (
         *_foreseen("simulated"),
         len(column("pose_design_predicted", "simulated_over_actual")),
@@ -345,8 +345,8 @@ def _over_five_laws(of: str, cone: str) -> float:
 
 claim(
     ACCURACY,
-    "the mean of the five ratios is at most {:.2f} (TRE) and {:.2f} (RP) with 40 degrees, {:.2f} "
-    "and {:.2f} with 10 degrees.",
+    "the mean of the five ratios (planned to random poses) is at most {:.2f} (TRE) and {:.2f} "
+    "(RP) with 40 degrees, {:.2f} and {:.2f} with 10 degrees.",
     lambda: [
         _over_five_laws(of, cone)
         for cone in ("wide", "narrow")
@@ -394,10 +394,10 @@ def _filled(of: str, *shares: str, poses: str = "planned") -> list[float]:
 
 claim(
     ACCURACY,
-    "If no planned pose fills space, {:.0f} to {:.0f} % of the recordings are told of it, and in "
-    "{:.0f} to {:.0f} % the verdict is good or fair although the error is beyond the end of its 95 "
-    "% interval. If a tenth does, it is {:.0f} to {:.0f} and at most {:.1f} %; if a fifth does, "
-    "{:.0f} and {:.0f} %.",
+    "If no planned pose fills space, the error is reported in {:.0f} to {:.0f} % of the "
+    "recordings, and in {:.0f} to {:.0f} % the verdict is good or fair although the error exceeds "
+    "the upper end of its 95 % interval. If a tenth fills space, these are {:.0f} to {:.0f} % and "
+    "at most {:.1f} %; if a fifth does, {:.0f} % and {:.0f} %.",
     lambda: [
         *percent(_filled("told_of", "0")),
         *percent(_filled("good_and_wrong", "0")),

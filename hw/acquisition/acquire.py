@@ -59,7 +59,7 @@ _FURTHEST_START_MM = 3.0
 _IMAGES_FOR_PREDICTION = 8
 NOT_CHECKED = (
     "reach, joints and singularities are NOT checked: neither the setup ([robot] model) nor the "
-    "controller names an arm that is known"
+    "controller names a known arm"
 )
 
 
@@ -190,8 +190,8 @@ def acquire(
         # The recorder's failure is the cause of what went wrong.
         reason = str(recorder.error)
     raise AcquisitionStopped(
-        f"{reason}; {estimator.count} of {job.images} images are in {recorder.kept}; put it "
-        f"right, then: {resume_command(recorder.kept, job.request)}",
+        f"{reason}; {estimator.count} of {job.images} images are in {recorder.kept}; correct "
+        f"this, then: {resume_command(recorder.kept, job.request)}",
         interrupted=interrupted,
         by_itself=by_itself and recorder.error is None,
     )

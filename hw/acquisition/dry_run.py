@@ -40,16 +40,16 @@ def dry_run(
             f"checked before the confirmation, or now with [robot] {known} in the setup"
         )
     else:
-        arm = f"a {motion.limits.arm_model} reaches every pose on every way: {course.text}"
+        arm = f"a {motion.limits.arm_model} can reach every pose along every path: {course.text}"
     return [
         f"dry run: {_poses(request, len(plan))}, {request.placement}, the tip travels "
         f"{plan.travel_mm:.0f} mm ({plan.passed_over} poses passed over)",
         *plan_lines(motion, tcp_offset_known=setup.tcp_offset is not None),
-        "every pose and every way between two lies within the limits",
+        "every pose, and every path between successive poses, is within the limits",
         arm,
-        "not looked at: which arm it is, its TCP offset, payload and speed slider; they are read, "
+        "not checked: which arm it is, its TCP offset, payload and speed slider; they are read, "
         "shown and confirmed with --move (jaxcal-hw check shows them now)",
-        f"nothing moved and {path} was not made; add --move to acquire",
+        f"nothing moved and {path} was not written; add --move to acquire",
     ]
 
 

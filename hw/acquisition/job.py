@@ -108,14 +108,14 @@ def motion_plan(job: Job, session: Session) -> MotionPlan:
     offset = session.poses.tcp_offset or job.setup.tcp_offset
     if offset is None:
         raise refused(
-            "this controller does not tell its TCP offset: put it into the setup as "
+            "this controller does not report its TCP offset: put it into the setup as "
             "[robot] tcp_offset = [x, y, z, rx, ry, rz] (m, rad); it is compared before moving"
         )
     if job.progress is not None:
         check_same_robot(job.progress.settings.get("robot"), identity.name, offset)
     pendant = session.poses.pendant
     if pendant is None:
-        raise refused("the controller does not tell its speed slider")
+        raise refused("the controller does not report its speed slider")
     limits = job.setup.motion_limits(controller_arm(identity.model, identity.version))
     joints = session.poses.latest().joints
     # Where every image was taken, only the end of the file is missing: any plan will do.

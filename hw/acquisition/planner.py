@@ -56,7 +56,7 @@ class Choice:
             f"predicted error over the image {self.tre_now_mm:.3f} mm; one more image would bring "
             f"it to {self.tre_then_mm:.3f} mm"
         )
-        return line if self.more is None else f"{line}; about {self.more} to what is wanted"
+        return line if self.more is None else f"{line}; about {self.more} more images are needed"
 
 
 class Planner:

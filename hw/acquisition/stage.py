@@ -172,7 +172,8 @@ class ProbeStage:
             if found.found[0]:
                 if self._before is not None and np.array_equal(image.array, self._before.array):
                     raise StaleError(
-                        "the image is the one of before the probe moved: is the machine frozen?",
+                        "the image is still that from before the probe moved: is the machine "
+                        "frozen?",
                         device="ultrasound",
                     )
                 contrast = float(found.contrast_db[0])

@@ -272,7 +272,7 @@ class ActiveEcho:
                 raise self._failure
         raise StaleError(
             f"no frame from {self.url} for {timeout_s:g} s: is the ultrasound machine frozen, or "
-            "its frame trigger unplugged?",
+            "is its frame trigger unplugged?",
             device=DEVICE,
         )
 
@@ -352,7 +352,7 @@ class ActiveEcho:
             raise RefusedError(f"{self.url} refused {word}: {answer[4:]}", device=DEVICE)
         if expected is not None and answer != expected:
             raise DeviceError(
-                f"{self.url} was told {word} {argument} and says {answer}", device=DEVICE
+                f"{self.url} was set to {word} {argument}, but reports {answer}", device=DEVICE
             )
         return answer
 

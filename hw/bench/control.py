@@ -113,7 +113,7 @@ class ControlClient:
             except OSError as error:
                 raise RuntimeError(f"the bench does not answer: {error}") from None
         if not line.endswith(b"\n"):
-            raise RuntimeError("the bench is gone")
+            raise RuntimeError("the emulated bench has ended")
         answer = json.loads(line)
         if "error" in answer:
             raise RuntimeError(f"the bench refused: {answer['error']}")

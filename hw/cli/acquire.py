@@ -53,8 +53,8 @@ _RESUMED_BY_ITSELF = 30
 @click.option(
     "--plan",
     type=click.Choice(PLANS),
-    help="How poses are planned: spread evenly beforehand, or chosen from a confirmed pool as the "
-    "images tell; then --images is the most.  [default: sobol]",
+    help="How poses are planned: spread evenly beforehand, or chosen during the run from a "
+    "confirmed pool, given the images so far; --images is then the maximum.  [default: sobol]",
 )
 @click.option(
     "--until-tre",
@@ -71,30 +71,36 @@ _RESUMED_BY_ITSELF = 30
 @click.option(
     "--phantom",
     type=click.Choice(PHANTOMS),
-    help="What is in the tank: an element that hears and answers, wires that only show in the "
-    "image, or a hydrophone that only hears.  [default: active-echo]",
+    help="What is in the tank: an element that receives and answers, wires that are only seen in "
+    "the image, or a hydrophone that only receives.  [default: active-echo]",
 )
 @click.option(
     "--operator",
     type=click.Choice(OPERATORS),
-    help="Who follows the injected pattern: you at this terminal, you before a window, or a rule.  "
+    help="Who follows the injected pattern: you at this terminal, you in a window, or a rule.  "
     "[default: person with --setup, simulated with --bench]",
 )
 @click.option(
     "--seed", type=click.IntRange(min=0), metavar="N", help="Seed of the plan.  [default: 0]"
 )
-@click.option("--every-frame", is_flag=True, help="Record every ultrasound frame, not one a pose.")
-@click.option("--resume", is_flag=True, help="Go on with RECORDING, which ended early.")
-@click.option("--move", is_flag=True, help="Move the robot, after a confirmation; else a dry run.")
+@click.option(
+    "--every-frame", is_flag=True, help="Record every ultrasound frame, not only one for each pose."
+)
+@click.option("--resume", is_flag=True, help="Continue RECORDING, which ended early.")
+@click.option(
+    "--move", is_flag=True, help="Move the robot, after a confirmation; without it, a dry run."
+)
 @click.option(
     "--unattended",
     metavar="DIGEST",
-    help="Move without asking anybody: then nobody at the robot says, just before it moves, that "
-    "its way is clear. DIGEST names the plan (16 digits or more, as --move shows it); "
-    "any other plan, robot, TCP offset, payload or speed slider is refused.",
+    help="Move without asking: then nobody at the robot confirms, just before it moves, that its "
+    "way is clear. DIGEST names the plan (16 digits or more, as --move shows it); any other plan, "
+    "robot, TCP offset, payload or speed slider is refused.",
 )
 @click.option("--preview", type=click.Path(), metavar="PNG", help="Draw the plan.")
-@click.option("--view", is_flag=True, help="Show it live in the browser, on this machine only.")
+@click.option(
+    "--view", is_flag=True, help="Show the run live in the browser, on this machine only."
+)
 @speed_option
 @controller_option
 @bench_seed_option
@@ -121,7 +127,7 @@ def acquire(
 ) -> int:
     """Take the images of a plan of poses, and calibrate from them.
 
-    RECORDING is the file to make (by default one named after the time), or to --resume.
+    RECORDING is the file to write (by default named after the time), or to --resume.
     """
     if bench == (setup_path is not None):
         also = ", also to --resume" if resume else ""
@@ -192,7 +198,7 @@ def acquire(
             from hw.acquisition.dry_run import draw
 
             if request is None:
-                raise InputError("--preview draws a new plan; it does not go with --resume")
+                raise InputError("--preview draws a new plan; it cannot be used with --resume")
             draw(setup, request, preview)
         return _acquire(setup, path, request, emulated, unattended, operator, view)
 

@@ -24,7 +24,7 @@ from jaxcal.cli.common import ExitCode
 @speed_option
 @controller_option
 def check(bench: bool, setup_path: str | None, speed: float | None, controller: str | None) -> int:
-    """Look at each device and say what is wrong; nothing moves."""
+    """Check each device and say what is wrong; nothing moves."""
     if bench == (setup_path is not None):
         raise InputError("give either --bench or --setup TOML")
     if (speed, controller) != (None, None) and not bench:

@@ -32,14 +32,17 @@ controller_option = click.option(
     help="Emulated bench: series of the robot, CB (125 poses/s) or e-Series (500).  [default: cb]",
 )
 bench_seed_option = click.option(
-    "--bench-seed", type=click.IntRange(min=0), metavar="N", help="Emulated bench: which world."
+    "--bench-seed",
+    type=click.IntRange(min=0),
+    metavar="N",
+    help="Emulated bench: seed of the simulated world.",
 )
 
 
 def check_resumed(recording: str | None, *allowed: str) -> None:
     """Refuse --resume without a recording, or with options but the allowed: the recording knows."""
     if recording is None:
-        raise InputError("--resume needs the RECORDING to go on with")
+        raise InputError("--resume needs the RECORDING to continue")
     context = click.get_current_context()
     for option in context.command.params:
         source = context.get_parameter_source(str(option.name))
@@ -48,7 +51,9 @@ def check_resumed(recording: str | None, *allowed: str) -> None:
             and source is ParameterSource.COMMANDLINE
             and option.name not in ("resume", *allowed)
         ):
-            raise InputError(f"{option.opts[0]} does not go with --resume: the recording knows")
+            raise InputError(
+                f"{option.opts[0]} cannot be used with --resume: the recording holds this setting"
+            )
 
 
 def started(

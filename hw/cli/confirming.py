@@ -53,7 +53,7 @@ def plan_page(plan: MotionPlan) -> list[str]:
     ]
     if not plan.identified:
         lines.append(
-            "NOTHING IDENTIFIES THIS ARM: its controller tells neither serial number nor "
-            "calibration, only its address is known; look which arm it is"
+            "NOTHING IDENTIFIES THIS ARM: its controller reports neither serial number nor "
+            "calibration, and only its address is known; make sure which arm it is"
         )
     return lines

@@ -23,7 +23,7 @@ from jaxcal.cli.sequence_options import spacing_option
 )
 @click.option("--from", "source", metavar="FRAME", help="Tracked frame on the probe, e.g. Probe.")
 @click.option("--to", "target_frame", metavar="FRAME", help="Frame the target rests in.")
-@click.option("--device", metavar="NAME", help="Of the images, where several are sent.")
+@click.option("--device", metavar="NAME", help="Device of the images, if several are sent.")
 @click.option(
     "--target",
     type=click.Choice(["echo", "cross"]),
@@ -62,7 +62,7 @@ from jaxcal.cli.sequence_options import spacing_option
     metavar="TOML",
     help="For pattern injection: [active_echo] url, [probe], and [scene] image_to_probe as drawn.",
 )
-@click.option("--resume", is_flag=True, help="Go on with RECORDING, as it was begun.")
+@click.option("--resume", is_flag=True, help="Continue RECORDING with its own options.")
 def free_hand(
     server: tuple[str, int],
     recording: str | None,
@@ -76,11 +76,11 @@ def free_hand(
     """Acquire with a hand-held probe: images and poses of a PlusServer or any OpenIGTLink tracker.
 
     Connects to HOST (port 18944), which must send IMAGE and TRANSFORM, or TRACKEDFRAME. Hold the
-    probe still over the target: an image is taken by itself where the target is credible and the
-    pose differs from those before. What is still missing is said. With --placement
-    pattern-injection you slide the probe across the mid-plane, back to where the injected bar is
-    longest, and accept with Enter. RECORDING is the file to make (by default one named after the
-    time); afterwards it is calibrated, as jaxcal calibrate would.
+    probe still over the target: an image is taken automatically if it shows a credible target and
+    the pose differs from those before. The command says which images are still missing. With
+    --placement pattern-injection you slide the probe across the mid-plane, back to where the
+    injected bar is longest, and accept with Enter. RECORDING is the file to write (by default named
+    after the time). At the end it is calibrated, as by jaxcal calibrate.
     """
     from hw.freehand.acquire import acquire_free_hand
     from hw.freehand.guide import Rules
@@ -100,7 +100,9 @@ def free_hand(
         }
         for name, given in unused.items():
             if given:
-                raise InputError(f"{name} is for segmented images: not with pattern-injection")
+                raise InputError(
+                    f"{name} is for segmented images; it cannot be used with pattern-injection"
+                )
     path = recording or f"free-hand-{datetime.now():%Y%m%d-%H%M%S}.h5"
     rules = Rules(target="cross" if target == "cross" else "echo", region=region)
     asked = FreeHand(*server, rules=rules, **options)

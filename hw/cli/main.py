@@ -25,8 +25,8 @@ from jaxcal.cli.run import run
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
     epilog="Exit status: 0 done; 2 bad usage or input, with one line that says what; 3 done, but "
     "the calibration did not converge; 4 a device failed: motion has ended, and the recording can "
-    "be resumed; 5 done, but the calibration is less than fair; 130 interrupted, with motion ended "
-    "as by 4.",
+    "be resumed; 5 done, but the calibration is less than fair; 130 interrupted: motion has "
+    "ended, as for 4.",
 )
 @click.version_option(__version__, prog_name="jaxcal-hw")
 def commands() -> None:

@@ -186,7 +186,7 @@ class _Run:
         if residual[worst] > max(_STANDS_OUT * float(np.median(residual)), _LEAST_MM):
             text += f"; image {worst + 1} stands out by {residual[worst]:.1f} mm"
             if worst == len(taken) - 1:
-                text += " (u takes it back)"
+                text += " (u removes it)"
         return text
 
     def _note(self, kind: str, text: str) -> None:

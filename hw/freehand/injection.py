@@ -346,9 +346,9 @@ class _Run:
         late = ""
         late_s = self._images[-1].image.late_s
         if self._late_s > _LATEST_S:
-            late = f"the element's frames are {self._late_s:.1f} s late: look at the link to it"
+            late = f"the element's frames are {self._late_s:.1f} s late: check the link to it"
         elif late_s > _LATEST_S:
-            late = f"the images are {late_s:.1f} s late: look at the link to the server"
+            late = f"the images are {late_s:.1f} s late: check the link to the server"
         if view is None:
             reason = self._images[-1].why or "the element is not heard"
             words = f"{title}: {late or f'{reason}: bring the probe over it'}"
@@ -381,7 +381,7 @@ class _Run:
         if view is None or not view.length:
             return "the element is not heard here"
         if not all(sides_seen(view.seen)):
-            return "look at both sides first: the bar must be seen to shrink on each"
+            return "visit both sides first: the bar must shrink on each"
         held, rules = list(self._held), self._asked.rules
         if not held or held[-1][0] - held[0][0] < 0.8 * rules.hold_s:
             return f"hold still for {rules.hold_s:g} s, then accept"
@@ -472,5 +472,5 @@ def hand_advice(view: View, peak_mm: float) -> str:
     if view.length >= view.longest // 2 and abs(away) <= 0.5 * _BESIDE_MM:
         return "here it is longest: hold still, Enter accepts"
     if abs(away) <= 0.5 * _BESIDE_MM:
-        return "it was longest here and is not now: s begins the sweep anew"
+        return "it was longest here but is not now: s restarts the sweep"
     return f"go {abs(away):.1f} mm {'up (+)' if away > 0 else 'down (-)'}, where the bar is longest"

@@ -111,7 +111,9 @@ def recorded_request(
             Rules(**{**told["rules"], "region": _four(told["rules"]["region"])}),
         ), told
     except (TypeError, KeyError, ValueError, IndexError, OverflowError):
-        raise InputError(f"{path}: has no settings of a {kind} run: begun otherwise?") from None
+        raise InputError(
+            f"{path}: has no settings of a {kind} run: was it begun by another command?"
+        ) from None
 
 
 def _four(region: object) -> tuple[int, int, int, int] | None:

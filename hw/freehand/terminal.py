@@ -9,9 +9,9 @@ import numpy as np
 from hw.midplane.terminal_image import Screen
 from hw.runtime.keys import Keyboard
 
-KEYS = "u: take the last image back, q or Enter: finish, Ctrl-C: stop (it can be resumed)"
+KEYS = "u: remove the last image, q or Enter: finish, Ctrl-C: stop (it can be resumed)"
 INJECTION_KEYS = (
-    "Enter: accept, s: begin the sweep anew, u: take the last image back, q: finish, Ctrl-C: stop"
+    "Enter: accept, s: restart the sweep, u: remove the last image, q: finish, Ctrl-C: stop"
 )
 _PERIOD_S = 0.15
 _OTHER_ROWS = 8

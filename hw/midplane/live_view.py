@@ -98,7 +98,7 @@ def advice(view: View) -> str:
         )
     if view.length > 0 and abs(view.offset_mm - middle_of(view.seen)) <= _NEAR_MM:
         return "This is the middle: Enter accepts it, s skips the pose."
-    return "The bar was seen to shrink on both sides: m lets the robot go to the middle."
+    return "The bar has shrunk on both sides: m moves the robot to the middle."
 
 
 def profile(view: View, columns: int = _PROFILE_COLUMNS) -> tuple[str, str]:

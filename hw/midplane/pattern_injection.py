@@ -291,7 +291,7 @@ def pattern_injection(
                     spread = np.hypot(low[1] - low[0], high[1] - high[0]) / np.sqrt(48.0)
                     spread = float(np.hypot(spread, settings.position_sd_mm / np.sqrt(2.0)))
                     return walker.placement("pattern-injection", where, edges, spread, echoes.peak)
-                message = "look at both sides first: the bar must be seen to shrink on each"
+                message = "visit both sides first: the bar must shrink on each"
                 continue
             where, echoes = walker.stop_at(decision.offset_mm)
         raise PlacementError(f"not accepted after {_MOST_LOOKS} looks")

@@ -179,8 +179,8 @@ class Walker:
         settings = self.settings
         if abs(offset) > settings.reach_mm:
             raise PlacementError(
-                f"the search wanted to go {offset:.1f} mm off the plan's pose; it may go "
-                f"{settings.reach_mm:g} mm"
+                f"the search would have to go {offset:.1f} mm from the planned pose, but may go "
+                f"only {settings.reach_mm:g} mm"
             )
         if self.moves >= settings.most_moves:
             raise PlacementError(f"the mid-plane was not found within {self.moves} moves")
@@ -241,7 +241,7 @@ class Walker:
                 return
         raise PlacementError(
             f"the response was lost, and is not heard at {place:+.2f} mm any more, where it "
-            "was: look at the element, its threshold and the coupling"
+            "was: check the element, its threshold and the coupling"
         )
 
     def leave(self) -> None:
@@ -318,8 +318,8 @@ def coarse(walker: Walker, start_mm: float = 0.0) -> float:
                 return start_mm + float(offset)
         tried = half
     raise PlacementError(
-        f"the element was not heard within {settings.span_mm:g} mm either side: is it on, is the "
-        "probe coupled, is the plan's pose right?"
+        f"no response of the element within {settings.span_mm:g} mm to either side: is it on, is "
+        "the probe coupled, is the plan's pose right?"
     )
 
 

@@ -154,14 +154,14 @@ def threshold_climb(
         apart = _apart(edges, peak, settings)
         if apart:
             raise PlacementError(
-                f"the threshold climb ends {apart:+.2f} mm beside the loudest place: the beam is "
-                "lopsided, or the target moved"
+                f"the threshold climb ends {apart:+.2f} mm from the place of the largest "
+                "amplitude: the beam is asymmetric, or the target moved"
             )
         walker.set_threshold(settings.low_threshold)
         where, echoes = walker.stop_at(edges.middle_mm)
         if not echoes.heard:
             walker.recover()
-            raise PlacementError("the response was lost at the place that the climb had found")
+            raise PlacementError("the response was lost at the place that the climb found")
         return walker.placement(
             "threshold-climb", where, (edges.low_mm, edges.high_mm), edges.sd_mm, echoes.peak
         )

@@ -202,7 +202,7 @@ class RecordingWriter:
         disk = os.fstatvfs(self._descriptor)
         if disk.f_bavail * disk.f_frsize < self.reserve_bytes:
             self.close()
-            raise OutputError(f"{self.path}: the disk is nearly full: make room")
+            raise OutputError(f"{self.path}: the disk is nearly full: free some space")
         # HDF5 has cut the file to its own length, so the bytes allocated ahead are gone.
         self._allocated, self._pending = os.fstat(self._descriptor).st_size, 0
         self._check_place()
@@ -257,7 +257,8 @@ class RecordingWriter:
         except OSError as error:
             self._close_file()
             raise OutputError(
-                f"{self.path}: the disk takes no more: {one_line(error)}: make room"
+                f"{self.path}: the disk cannot be written any more: {one_line(error)}: free some "
+                "space"
             ) from None
 
     def _allocate(self, end: int) -> None:

@@ -216,19 +216,19 @@ class Session:
                 count = recent.count(what)
                 if count > watch.burst:
                     return StaleError(
-                        f"{count} frames {what} within {window:.2g} s: look at its cable",
+                        f"{count} frames {what} within {window:.2g} s: check its cable",
                         device="active echo",
                     )
             if now - self._echo_seen > self.clock.patience(watch.echo_age_s):
                 return StaleError(
                     f"no frame for {now - self._echo_seen:.2f} s: is the ultrasound machine "
-                    "frozen, or its frame trigger unplugged?",
+                    "frozen, or is its frame trigger unplugged?",
                     device="active echo",
                 )
             late = self._echo_frames[-1].late_s if self._echo_frames else 0.0
             if late > self.clock.patience(watch.echo_late_s):
                 return StaleError(
-                    f"echo frames are {late:.1f} s late: look at the link to the device, e.g. a "
+                    f"echo frames are {late:.1f} s late: check the link to the device, e.g. a "
                     "bridge from serial line to network",
                     device="active echo",
                 )
@@ -309,7 +309,7 @@ class Session:
                 self._changed.wait(self.clock.wall(0.1))
         self.check()
         late = image.late_s if image is not None else 0.0
-        what = f"the images are {late:.1f} s late: look at the link to the machine"
+        what = f"the images are {late:.1f} s late: check the link to the machine"
         what = what if late > self.watch.image_age_s else "no B-mode frame came in time"
         raise StaleError(what, device="ultrasound")
 

@@ -98,8 +98,8 @@ def read_identity(host: str, *, timeout_s: float = 3.0) -> Identity:
     number = re.search(r"\d+\.\d+\.\d+(\.\d+)?", version)
     if number is None:
         raise LostError(
-            f"the dashboard of {host} tells no version but {quoted(version)}: look at "
-            "the pendant, or restart the controller",
+            f"the dashboard of {host} reports no version but {quoted(version)}: check the "
+            "pendant, or restart the controller",
             device="robot",
         )
     return Identity(

@@ -222,7 +222,9 @@ class Motion:
         with contextlib.suppress(queue.Empty):
             while not answer.get("ended", False):
                 answer = self._answers.get(timeout=max(0.0, deadline - time.monotonic()))
-        self._kill(error_of(answer) or LostError("the motion process hangs", device="robot"))
+        self._kill(
+            error_of(answer) or LostError("the motion process does not respond", device="robot")
+        )
 
     def _wait(self, count: int) -> PoseSample:
         """Wait for a move's answer; a stop is sent again until the other process confirms it."""
@@ -268,7 +270,9 @@ class Motion:
             silent = time.monotonic() - self._heard
             if silent > _HANGS_WALL_S + self.clock.wall(0.5):
                 error = (
-                    self._stop or stopping or LostError("the motion process hangs", device="robot")
+                    self._stop
+                    or stopping
+                    or LostError("the motion process does not respond", device="robot")
                 )
                 self._in_motion = False
                 self._kill(error)

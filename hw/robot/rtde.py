@@ -61,14 +61,14 @@ _SAFETY_STATES = (
     (7, "emergency stop", f"release it, then {_POWER}"),
     (8, "safety violation", "read the pendant's log, then restart the robot's safety there"),
     (9, "safety fault", "read the pendant's log, then restart the controller"),
-    (10, "stopped by safety", "look at the pendant"),
+    (10, "stopped by safety", "check the pendant"),
 )
 """Bits of safety_status_bits above normal and reduced, and what a person must do."""
 _SUMMARIES = (1 << 7) | (1 << 10)
 """Bits that are set besides the one that says more."""
 _MODES = {
-    -1: ("no controller", "look at the pendant"),
-    0: ("disconnected", "look at the pendant"),
+    -1: ("no controller", "check the pendant"),
+    0: ("disconnected", "check the pendant"),
     1: ("waiting for its safety configuration", "confirm it at the pendant"),
     2: ("booting", "wait until it has started"),
     3: ("powered off", _POWER),
@@ -88,7 +88,7 @@ def safety_text(bits: int) -> str:
     shown = wrong & ~_SUMMARIES or wrong
     found = [state for state in _SAFETY_STATES if shown >> state[0] & 1]
     if not found:
-        return f"safety bits {bits:#x}: look at the pendant" if wrong else ""
+        return f"safety bits {bits:#x}: check the pendant" if wrong else ""
     return f"{', '.join(name for _, name, _ in found)}: {found[-1][2]}"
 
 
@@ -97,7 +97,7 @@ def state_text(robot_mode: int, safety_bits: int) -> str:
     problem = safety_text(safety_bits)
     if problem or robot_mode == RUNNING_MODE:
         return problem
-    name, cure = _MODES.get(robot_mode, (f"in mode {robot_mode}", "look at the pendant"))
+    name, cure = _MODES.get(robot_mode, (f"in mode {robot_mode}", "check the pendant"))
     return f"the robot is not running, it is {name}: {cure}"
 
 
@@ -218,8 +218,8 @@ def too_late(latency_s: float, limit_s: float) -> LostError | None:
         return None
     return LostError(
         f"the poses may be on their way for {latency_s * 1000:.0f} ms, over the limit of "
-        f"{limit_s * 1000:.0f} ms: connect by a shorter way (a cable, no tunnel), or give this "
-        "computer less other work",
+        f"{limit_s * 1000:.0f} ms: use a more direct connection (a cable, no tunnel), or reduce "
+        "the load of this computer",
         device="robot",
     )
 
@@ -321,7 +321,7 @@ class PacketReader:
             while len(data) - start >= 3:
                 (size,) = struct.unpack_from(">H", data, start)
                 if size < 3:
-                    raise LostError("what came is no RTDE data", device="robot")
+                    raise LostError("what was received is not RTDE data", device="robot")
                 if len(data) - start < size:
                     break
                 message = bytes(data[start + 2 : start + size])
@@ -335,7 +335,7 @@ class PacketReader:
             raise refused("the controller does not speak RTDE version 2")
         answer = self._ask(b"v", b"", deadline)
         if len(answer) != 16:
-            raise LostError("the controller did not tell its version", device="robot")
+            raise LostError("the controller did not report its version", device="robot")
         self.version: tuple[int, ...] = struct.unpack(">4I", answer)
         self.frequency_hz = frequency_hz or (500.0 if self.version[0] >= 5 else 125.0)
         names = list(FIELDS)
@@ -407,7 +407,7 @@ class PacketReader:
             if len(data) >= 3:
                 (size,) = struct.unpack_from(">H", data)
                 if size < 3:
-                    raise LostError("what came is no RTDE data", device="robot")
+                    raise LostError("what was received is not RTDE data", device="robot")
                 if len(data) >= size:
                     if data[2:3] == b"U":
                         # If it is bad, :meth:`read` will say what is wrong with it.

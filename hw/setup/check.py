@@ -78,7 +78,7 @@ def _robot(setup: Setup, seconds: float) -> Finding:
         if steady.scatter_mm > 0.2:
             wrong.append(f"it does not rest: poses scatter by {steady.scatter_mm:.2f} mm")
         if stream.tcp_offset is None and setup.tcp_offset is None:
-            wrong.append("it does not tell its TCP offset: put [robot] tcp_offset into the setup")
+            wrong.append("it does not report its TCP offset: put [robot] tcp_offset into the setup")
     name = identity.name
     if not identity.identified:
         name += " (nothing identifies this arm: neither serial number nor calibration is told)"
@@ -107,7 +107,7 @@ def _active_echo(setup: Setup, seconds: float) -> Finding:
                 "other lengths): are the line triggers connected, the number of lines right?"
             )
         if counts.crc_errors:
-            wrong.append(f"{counts.crc_errors} frames arrived damaged: look at its cable")
+            wrong.append(f"{counts.crc_errors} frames arrived damaged: check its cable")
         if counts.lost:
             wrong.append(f"{counts.lost} frames were lost: look at its trigger")
         error = echo.device_error()

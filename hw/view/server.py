@@ -107,7 +107,7 @@ def check_refusal(port: int) -> None:
         connection.request("GET", "/", headers={"Host": "elsewhere"})
         if connection.getresponse().status != 403:
             raise NotImplementedError(
-                "this viser listens in a way that is not known: install viser 1.1"
+                "this version of viser listens in an unknown way: install viser 1.1"
             )
 
 
@@ -124,7 +124,8 @@ def ignore_browsers(server: Any) -> None:
     listener = getattr(server, "_websock_server", None)
     if not callable(getattr(listener, "_handle_incoming_message", None)):
         raise NotImplementedError(
-            "this viser takes messages of browsers in a way that is not known: install viser 1.x"
+            "this version of viser handles messages of browsers in an unknown way: install viser "
+            "1.x"
         )
 
     async def dropped(client_id: int, message: object) -> None:

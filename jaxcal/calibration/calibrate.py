@@ -70,15 +70,16 @@ def calibrate(
         method: ``joint`` (X, c and every offset together), ``alternating`` (the paper's Fig. 4) or
             ``conventional`` (Eq. 7, every target in the plane). All can be differentiated, but the
             alternation only with tolerances so small that it reaches the minimum.
-        prior: of the joint method. ``auto``: errors have self-tuned SDs, and the data weigh the
-            offsets' laws, their mean and the noise models (:mod:`jaxcal.solvers.auto`).
-            ``uniform``: the same with offsets that are uniform between unknown edges.
+        prior: distribution of the offsets in the joint method. ``auto``: SDs are estimated, and the
+            answer is an average over several distributions of the offsets, with or without a mean,
+            and over noise models, weighted by their probability (:mod:`jaxcal.solvers.auto`).
+            ``uniform``: the same, but only with uniform distributions of the offsets.
             ``gaussian``: offsets and errors are Gaussian, with the SDs of ``sigma`` or, without it,
-            self-tuned by REML. ``bounded``: |y_i| <= max_elevation with equal weights, the
+            estimated by REML. ``bounded``: |y_i| <= max_elevation with equal weights, the
             alternation's objective. With given ``sigma``, ``auto`` is ``gaussian``.
         max_elevation: bound m on |y|, mm, one number or (n,); overrides the problem's own. Without
-            either bound, the alternation and ``bounded`` use 1 mm. ``auto`` and ``uniform`` cut off
-            the law of each image's offset at the bound.
+            either bound, the alternation and ``bounded`` use 1 mm. ``auto`` and ``uniform``
+            truncate the distribution of each image's offset at the bound.
         sigma: given SDs of lateral position, range and elevational offset, mm; on channels, of an
             element's distance and the elevational offset.
         tracker_sd: isotropic SD of the tracked position, mm; only with a given ``sigma``.
@@ -86,21 +87,24 @@ def calibrate(
             name, or several.
         data: ``channels``: the joint method's residuals are those of every element's time of flight
             (the recording must hold them); ``points``: those of the segmented points; ``auto``:
-            channels where they tell more: on curvilinear probes and for sound speed or delay.
-        sound_speed_sd: how far the sound speed may be from nominal, m/s (joint only, not bounded).
-        delay_sd: how far the delay may be from nominal, s (joint only, not bounded).
+            channels if they hold more information: on curvilinear probes and for sound speed or
+            delay.
+        sound_speed_sd: prior SD of the sound speed about its nominal value, m/s (joint method,
+            except ``bounded``).
+        delay_sd: prior SD of the delay about its nominal value, s (joint method, except
+            ``bounded``).
         options: tolerances and limits.
         robust: first find the images that agree with each other, even if nearly half of all images
             are wrong (:mod:`jaxcal.solvers.consensus`), and leave the others out. Many images that
             are wrong in the same way, by a few mm (a mount that slipped), agree with each other and
-            may stay. ``outlier`` and ``departure`` say which and why. If no image is gravely wrong,
-            none is left out, and the answer is the same as without ``robust``.
+            may stay. ``outlier`` and ``departure`` say which and why. If no image has a gross
+            error, none is left out, and the answer is the same as without ``robust``.
 
     Returns:
         A :class:`Calibration`; read its ``status`` and ``warnings`` before using it. The frames of
-        one pose count as one image, and those of frozen tracking are left out
-        (:mod:`jaxcal.calibration.dependence`); the others are masked out in the answer and in its
-        ``problem``. Errors that are alike in successive images widen its covariance
+        one pose count as one image, and frames of frozen tracking are left out
+        (:mod:`jaxcal.calibration.dependence`); frames that do not count are masked out in the
+        answer and in its ``problem``. Errors correlated in successive images widen its covariance
         (:mod:`jaxcal.calibration.serial_correlation`). All this is done for one problem with
         concrete arrays only; under jit, vmap or grad, and in batches, images are treated as
         independent.
@@ -178,9 +182,10 @@ def calibrate_batch(
     robust: bool = False,
     chunk: int | None = None,
 ) -> Calibration:
-    """:func:`calibrate` for a batch: compiled, vmapped, in chunks of lanes.
+    """:func:`calibrate` for a batch of problems, compiled once and solved in chunks.
 
-    A bad lane (NaN, degenerate) gets its own status and does not affect the others.
+    A problem that cannot be solved (NaN, degenerate) gets its own status and does not affect the
+    others.
 
     Problems that are not committed to a device are divided among all of JAX's local devices. A
     processor is one device, unless ``jax.config.update("jax_num_cpu_devices", n)`` (or
@@ -190,19 +195,20 @@ def calibrate_batch(
     Args:
         problems: leading axes of any shape; see :func:`jaxcal.stack`. A list of problems or
             recordings is stacked; all must have the same number of images.
-        method: as for :func:`calibrate`, and so are the following.
-        prior: see there.
-        max_elevation: see there.
-        sigma: see there.
-        tracker_sd: see there.
-        estimate: see there.
-        data: see there.
-        sound_speed_sd: see there.
-        delay_sd: see there.
-        options: see there.
-        robust: see there; it takes longer than the solve.
-        chunk: lanes solved side by side; by default 32 on a processor (64 where laws are weighed, 8
-            on channels), and on a GPU as many as have a million images together.
+        method: as for :func:`calibrate`.
+        prior: as for :func:`calibrate`.
+        max_elevation: as for :func:`calibrate`.
+        sigma: as for :func:`calibrate`.
+        tracker_sd: as for :func:`calibrate`.
+        estimate: as for :func:`calibrate`.
+        data: as for :func:`calibrate`.
+        sound_speed_sd: as for :func:`calibrate`.
+        delay_sd: as for :func:`calibrate`.
+        options: as for :func:`calibrate`.
+        robust: as for :func:`calibrate`; it takes longer than the solve.
+        chunk: number of problems solved together; by default 32 on a processor (64 with priors
+            ``auto`` and ``uniform``, 8 on channels), and on a GPU as many as have a million images
+            together.
 
     Returns:
         A :class:`Calibration` whose arrays have the problems' leading axes.

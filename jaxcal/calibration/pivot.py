@@ -96,14 +96,14 @@ class Pivot(eqx.Module):
 
     @property
     def weakest(self) -> Float[np.ndarray, "*batch 3"]:
-        """Unit vector of the least known direction of the tip, in the tool's frame (concrete)."""
+        """Unit vector of the tip's least determined direction, in the tool's frame (concrete)."""
         weakest = self._weakest()[0][..., :3]
         length = np.linalg.norm(weakest, axis=-1, keepdims=True)
         return weakest / np.maximum(length, 1e-30)
 
     @property
     def weakest_sd(self) -> Float[np.ndarray, "*batch"]:
-        """SD along the least known direction of tip and point, mm; NaN if it is not finite."""
+        """SD along the least determined direction of tip and point, mm; NaN if it is not finite."""
         return self._weakest()[1]
 
     def _weakest(self) -> tuple[np.ndarray, np.ndarray]:

@@ -112,7 +112,7 @@ def cross_validate(
     result: Calibration | None = None,
     **arguments: Any,
 ) -> CrossValidation:
-    """Hold out each image (or each of some folds) in turn.
+    """Hold out each image (or fold of images) in turn, and calibrate from the others.
 
     Args:
         problem: one problem or a recording.
@@ -188,7 +188,7 @@ def bootstrap(
     result: Calibration | None = None,
     **arguments: Any,
 ) -> Bootstrap:
-    """Draw the used images anew with replacement, and calibrate each draw.
+    """Calibrate samples of the used images that are drawn with replacement.
 
     Args:
         problem: one problem or a recording.

@@ -59,12 +59,12 @@ def apply(
     skip_invalid: bool,
     out: str | None,
 ) -> int:
-    """Take image points through the calibration CAL, as a table with standard deviations.
+    """Map image points by the calibration CAL; prints a table with standard deviations.
 
     SOURCE is a table with columns u and v, and a pose (probe to tracker) if points in the tracker's
-    frame are wanted; or a recording (.h5). Standard deviations and covariances are those of the
-    calibration (estimated pixel sizes included) and of --pixel-sd; not of the pose. Images of a
-    recording that are masked out are left out; a last column, image, has the numbers of the others.
+    frame are wanted; or a recording (.h5). Standard deviations and covariances include those of the
+    calibration (with estimated pixel sizes) and of --pixel-sd, but not those of the pose. Masked
+    images of a recording are left out; a last column, image, has the numbers of the others.
     """
     import numpy as np
 
@@ -81,7 +81,7 @@ def apply(
     }
     unused = [option for option, given in stated.items() if given]
     if unused and (source is None or _is_recording(source)):
-        raise click.UsageError(f"{', '.join(unused)}: for tables, and none is read")
+        raise click.UsageError(f"{', '.join(unused)}: for tables, but no table is read")
     if out is not None:
         inputs = [calibration] if source is None else [calibration, source]
         check_output(out, "such a table", begins_with(",".join(_COLUMNS).encode()), inputs)
@@ -137,7 +137,7 @@ def _read(source: str, quaternion, pose_units, skip_invalid: bool):
     of_poses = {"--quaternion": quaternion, "--pose-units": pose_units}
     unused = [option for option, value in of_poses.items() if value is not None]
     if unused and table.poses is None:
-        raise click.UsageError(f"{', '.join(unused)}: for poses, and {source} holds none")
+        raise click.UsageError(f"{', '.join(unused)}: for poses, but {source} holds none")
     return table.points, table.poses, table.kind, ("line", table.lines) if skip_invalid else None
 
 

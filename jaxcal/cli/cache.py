@@ -71,8 +71,8 @@ def show(as_json: bool) -> int:
     default=WARMED_IMAGES,
     show_default=True,
     metavar="N",
-    help="Number of images, may be repeated; its program serves every number up to the next "
-    "of 8, 12, 16, 24, 32, 48, 64, 96, ...",
+    help="Number of images; may be repeated. One program serves every number of images up to the "
+    "next of 8, 12, 16, 24, 32, 48, 64, 96, ...",
 )
 @click.option(
     "--method",
@@ -96,8 +96,8 @@ def warm(
 ) -> int:
     """Compile now what later runs of "jaxcal calibrate" need.
 
-    For recordings that hold what REC holds; without it, for points in mm or, with --estimate scale,
-    in pixels.
+    Compiles for recordings of the same kind as REC; without REC, for points in mm or, with
+    --estimate scale, in pixels.
     """
     if not program_cache.is_on():
         raise InputError(f"the cache is off: {program_cache.SWITCH} is set")

@@ -46,8 +46,8 @@ EXPORTS: tuple[SaveFormat, ...] = ("plus", "slicer", "itk", "ros", "tusrec", "nu
     type=click.Choice(get_args(Method)),
     default="joint",
     show_default=True,
-    help="joint: transform, target and elevational offsets together; alternating: the paper's; "
-    "conventional: every target is assumed to lie in the image plane.",
+    help="joint: estimate transform, target and elevational offsets together; alternating: the "
+    "paper's method; conventional: assume that every target lies in the image plane.",
 )
 @click.option(
     "--prior",
@@ -55,7 +55,7 @@ EXPORTS: tuple[SaveFormat, ...] = ("plus", "slicer", "itk", "ros", "tusrec", "nu
     default="auto",
     show_default=True,
     help="Distribution of the offsets in the joint method; auto: an average over several, "
-    "weighed by the data.",
+    "weighted by their probability.",
 )
 @click.option(
     "--max-elevation",
@@ -81,8 +81,8 @@ EXPORTS: tuple[SaveFormat, ...] = ("plus", "slicer", "itk", "ros", "tusrec", "nu
     type=click.Choice(get_args(Data)),
     default="auto",
     show_default=True,
-    help="What the joint method fits where the recording holds times of flight: the points that "
-    "are segmented from them, or every element's; auto: whichever says more.",
+    help="What the joint method fits if the recording holds times of flight: the points segmented "
+    "from them, or the time of every element (channels); auto: whichever holds more information.",
 )
 @click.option(
     "--robust/--no-robust",
@@ -94,26 +94,26 @@ EXPORTS: tuple[SaveFormat, ...] = ("plus", "slicer", "itk", "ros", "tusrec", "nu
 @click.option(
     "--solver",
     type=click.Choice(get_args(SolverName)),
-    help="Of the conventional method; lm by default.",
+    help="Solver of the conventional method; lm by default.",
 )
 @click.option(
     "--tolerance-mm",
     type=POSITIVE,
     metavar="MM",
     help="The alternation stops when a round moves the transform by less than this (0.1 by "
-    "default)",
+    "default) and turns it by less than --tolerance-rad.",
 )
 @click.option(
     "--tolerance-rad",
     type=POSITIVE,
     metavar="RAD",
-    help="and turns it by less than this (0.001 by default).",
+    help="Rotation below which the alternation stops, see --tolerance-mm (0.001 by default).",
 )
 @click.option(
     "--max-rounds",
     type=click.IntRange(min=1),
     metavar="N",
-    help="Most rounds of the alternation (1000 by default).",
+    help="Largest number of rounds of the alternation (1000 by default).",
 )
 @click.option(
     "--test",
@@ -124,14 +124,15 @@ EXPORTS: tuple[SaveFormat, ...] = ("plus", "slicer", "itk", "ros", "tusrec", "nu
 @click.option(
     "--cross-validate",
     is_flag=True,
-    help="Look at every image through a calibration of the others: precision on images that were "
-    "not used, and how much each image moves the answer.",
+    help="Test every image with a calibration from the others: precision on images that were not "
+    "used, and how much each image changes the calibration.",
 )
 @click.option(
     "--bootstrap",
     type=click.IntRange(2, 100_000),
     metavar="N",
-    help="Calibrate N times from images drawn anew, and tell how the answers scatter.",
+    help="Calibrate N times from images drawn with replacement, and say how the calibrations "
+    "scatter.",
 )
 @click.option(
     "--export",
@@ -185,7 +186,7 @@ def calibrate(
     out: str | None,
     as_json: bool,
 ) -> int:
-    """Calibrate from the recording REC; nobody has to supply a starting guess."""
+    """Calibrate from the recording REC. No starting guess is needed."""
     inputs = [recording] if test is None else [recording, test]
     targets = [_export_target(export, inputs, out) for export in exports]
     import_engine()
@@ -304,8 +305,8 @@ def _check_pixels(recording: Recording, targets: list[tuple[SaveFormat, str]]) -
     for format, path in targets:
         if needs_pixels(path, format):
             raise InputError(
-                f"--export {format}:{path}: {recording.source} holds no pixels, whose size this "
-                "format needs: calibrate with --out, then jaxcal export with --pixel-size"
+                f"--export {format}:{path}: {recording.source} holds no pixels, but this format "
+                "needs their size: calibrate with --out, then jaxcal export with --pixel-size"
             )
 
 
@@ -319,7 +320,7 @@ def _export(
     from jaxcal.result.saved import transform_from_record
 
     if not record["converged"] or record["wrong_frames"]:
-        return ["exported: nothing, since the calibration is not to be used"]
+        return ["exported: nothing, because the calibration must not be used"]
     transform = transform_from_record(record, source=recording)
     said: list[str] = []
     for format, path in targets:
@@ -338,8 +339,8 @@ def _segmented(recording: Recording) -> tuple[Recording, list[str]]:
         return recording, []
     if not raw:
         raise InputError(
-            f"{recording.source}: the test images hold times of flight beside other calibration "
-            "images: segment them first"
+            f"{recording.source}: the test images hold times of flight, but the calibration "
+            "images do not: segment them first"
         )
     from jaxcal.data.segmentation.segment import segment_recording
 

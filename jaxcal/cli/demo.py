@@ -39,8 +39,8 @@ def demo(out: str | None, seed: int, as_json: bool) -> int:
     """Simulate an experiment, calibrate it three ways, and compare them.
 
     50 images whose target lies up to 2 mm out of the image plane, with 0.5 mm of noise on every
-    element's distance; the alternation takes its bound of 1 mm from the paper. The first run
-    compiles for a while; later ones take seconds.
+    element's distance; the alternation uses the paper's bound of 1 mm. The first run takes about a
+    minute to compile; later ones take seconds.
     """
     import_engine()
     from jaxcal.io.outputs import check_output, is_simulated

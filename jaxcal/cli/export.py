@@ -67,14 +67,14 @@ def _one_format(_: click.Context, __: click.Parameter, given: tuple[str, ...]) -
     type=POSITIVE,
     nargs=2,
     metavar="LATERAL AXIAL",
-    help="Of a calibration from points in mm: size of a pixel, mm,",
+    help="For a calibration from points in mm: size of a pixel, mm.",
 )
 @click.option(
     "--origin",
     type=float,
     nargs=2,
     metavar="U V",
-    help="and the pixel of lateral 0 and range 0 (0 0 by default).",
+    help="With --pixel-size: the pixel of lateral 0 and range 0 (0 0 by default).",
 )
 def export(
     calibration: str,

@@ -30,15 +30,15 @@ from jaxcal.cli.sequence_options import beside, given_options, table_options, tr
     type=click.IntRange(0, 65535),
     default=0,
     metavar="N",
-    help="Of the page, on 127.0.0.1; by default any that is free.",
+    help="Port of the page, on 127.0.0.1; by default any free one.",
 )
 def pick(frames: str, picks: str | None, every: int, port: int, **options: Any) -> int:
     """Place the target's point in each frame of SOURCE by a click, and save them in PICKS.csv.
 
     For frames in which `jaxcal import` finds no credible target. SOURCE is a sequence or a folder
-    of PNG. Prints the address of a page that only this machine, and only who has the address, can
-    open. Every click is saved at once; the same command goes on where it was ended. By default
-    PICKS.csv is beside SOURCE and has its name.
+    of PNG. Prints the address of a local web page, which can be opened only on this machine and
+    only with this address. Every click is saved at once; run the same command again to continue. By
+    default PICKS.csv is beside SOURCE and has its name.
     """
     from jaxcal.io.atomic import check_writable
     from jaxcal.io.frame_poses import frames_to_show, open_sequence
@@ -62,7 +62,7 @@ def pick(frames: str, picks: str | None, every: int, port: int, **options: Any) 
     with Picker(placed, pictures, name, port) as page:
         try:
             click.echo(f"{len(shown)} frames to show; open {page.url}")
-            click.echo("Finish on the page, or Ctrl-C, ends; every click is saved")
+            click.echo("to end: Finish on the page, or Ctrl-C; every click is saved")
             while not page.wait(0.5):
                 pass
         except KeyboardInterrupt:
@@ -78,7 +78,7 @@ def _tell(placed: Any, source: str, out: str, options: dict[str, Any]) -> None:
         return
     click.echo(
         f"{out}: {count} points, {len(placed.skipped)} frames skipped"
-        + (f", {left} still to do (the same command goes on)" if left else "")
+        + (f", {left} still to do (the same command continues)" if left else "")
     )
     if count:
         import_them = ["jaxcal", "import", source, out, "OUT.h5", *given_options(options)]

@@ -16,7 +16,9 @@ from jaxcal.cli.common import (
 
 @click.command()
 @click.argument("poses", type=click.Path(), metavar="POSES")
-@click.option("--no-robust", is_flag=True, help="Use every pose, those that do not fit as well.")
+@click.option(
+    "--no-robust", is_flag=True, help="Use every pose, also those that do not fit the rest."
+)
 @json_option
 def pivot(poses: str, no_robust: bool, as_json: bool) -> int:
     """Find the tip of a tracked tool that was turned about its tip.

@@ -55,21 +55,21 @@ _PICTURES = (
     "--until-tre",
     type=POSITIVE,
     metavar="MM",
-    help="As many poses as this predicted error over the image takes; without REC at least "
-    f"{MINIMUM_SELF_TUNING}, since fewer do not tune the SDs.",
+    help="As many poses as are needed for this predicted error in the image; without REC at "
+    f"least {MINIMUM_SELF_TUNING}, because fewer are not enough to estimate the SDs.",
 )
 @click.option(
     "--criterion",
     type=click.Choice(["tre", "rp", "d"]),
     default="tre",
     show_default=True,
-    help="What to make small: target registration error, reconstruction precision, or the volume "
+    help="What to minimise: target registration error, reconstruction precision, or the volume "
     "of the confidence ellipsoid.",
 )
 @click.option(
     "--probe",
     type=click.Choice(["linear", "curvilinear"]),
-    help="Transducer where the recording names none: L14-5 or C5-2.  [default: linear; with REC "
+    help="Transducer, if the recording names none: L14-5 or C5-2.  [default: linear; with REC "
     "where its target was]",
 )
 @click.option(
@@ -83,7 +83,7 @@ _PICTURES = (
     "--lateral",
     type=POSITIVE,
     metavar="MM",
-    help="Lateral position of the target, up to this either way.  [default: 0.41 of the aperture; "
+    help="Largest lateral position of the target, to either side.  [default: 0.41 of the aperture; "
     "with REC where it was]",
 )
 @click.option(
@@ -118,8 +118,8 @@ _PICTURES = (
     type=click.Choice(OFFSET_LAWS),
     multiple=True,
     metavar="LAW",
-    help="Calibrate 1,000 simulated recordings of the planned poses, and say how far off they are. "
-    f"LAW is that of the elevational offsets: {', '.join(OFFSET_LAWS)}. May be repeated.",
+    help="Calibrate 1,000 simulated recordings of the planned poses, and report their error. LAW "
+    f"is the distribution of the elevational offsets: {', '.join(OFFSET_LAWS)}. May be repeated.",
 )
 @click.option("--figure", type=click.Path(), metavar="PNG", help="Draw the plan.")
 @json_option
@@ -140,17 +140,18 @@ def plan(
     figure: str | None,
     as_json: bool,
 ) -> int:
-    """Plan which poses to take images from, and say how many a wanted error takes.
+    """Plan which poses to take images from, and how many are needed for a given error.
 
-    Without REC from a probe and a region alone; with REC it calibrates (joint) and says what to
-    add. Poses are told in words for a hand-held probe; --json has them as matrices.
+    Without REC, plans from a probe and a region alone; with REC, calibrates from it (joint method)
+    and says which images to add. Poses are described in words for a hand-held probe; --json has
+    them as matrices.
     """
     if images is not None and until_tre is not None:
         raise InputError("give either --images or --until-tre")
     if recording is None and estimate is not None:
         raise InputError("--estimate needs a recording")
     if recording is not None and sigma is not None:
-        raise InputError("--sigma does not go with a recording: its images tell the SDs")
+        raise InputError("--sigma cannot be used with a recording: its images determine the SDs")
     import_engine()
     from jaxcal import design
     from jaxcal.design.count import MOST_IMAGES
@@ -340,14 +341,14 @@ def _print(found: Plan, record: dict[str, Any], figure: str | None) -> None:
         "the lateral position is smallest. Take them in any order.",
         f"Predicted with {these}{before}: error over the image "
         f"{found.tre_mm[-1]:.2g} mm, reconstruction precision {found.rp_mm[-1]:.2g} mm.",
-        *([f"How many images an error takes: {'; '.join(counts)}."] if counts else []),
+        *([f"Images needed: {'; '.join(counts)}."] if counts else []),
         *(_simulated_in_words(errors) for errors in record.get("simulated", ())),
         *([] if figure is None else [f"figure: {figure}"]),
     )
 
 
 def _simulated_in_words(errors: dict[str, Any]) -> str:
-    lost = f" {errors['lost']} had no answer." if errors["lost"] else ""
+    lost = f" {errors['lost']} could not be calibrated." if errors["lost"] else ""
     return (
         f"In {errors['trials']} simulated recordings with {errors['law']} offsets: error over the "
         f"image {errors['tre_mm']:.2g} mm (below {errors['tre_95_mm']:.2g} mm in 95 of 100), "

@@ -42,22 +42,22 @@ if TYPE_CHECKING:
     type=click.Choice(["least-squares", "shortest"]),
     default="least-squares",
     show_default=True,
-    help="least-squares: on every element's time; shortest: the first element to answer.",
+    help="least-squares: fit the times of all elements; shortest: use the shortest time.",
 )
 @click.option(
     "--robust/--no-robust",
     default=True,
     show_default=True,
-    help="Weights against lines that are not the target's echo (least-squares).",
+    help="Give little weight to lines that do not show the target's echo (least-squares).",
 )
 @click.option(
     "--scale",
     type=click.Choice(["frame", "pooled"]),
     default="frame",
     show_default=True,
-    help="Noise of each frame by itself, or one for all (least-squares).",
+    help="Estimate the noise for each frame, or one for all frames (least-squares).",
 )
-@click.option("--interpolate", is_flag=True, help="Between elements (shortest).")
+@click.option("--interpolate", is_flag=True, help="Interpolate between elements (shortest).")
 @click.option(
     "--sound-speed",
     type=POSITIVE,
@@ -74,8 +74,8 @@ if TYPE_CHECKING:
     "--out",
     type=click.Path(),
     metavar="OUT.h5",
-    help="By default REC-segmented.h5, beside REC. The name of REC itself replaces it, unless REC "
-    "is an acquisition with its raw data.",
+    help="By default REC-segmented.h5, beside REC. If it is REC itself, REC is replaced, unless "
+    "it is an acquisition with raw data.",
 )
 @tracking_options
 @search_options
@@ -98,13 +98,14 @@ def segment(
     """Segment times of flight, or the frames of a sequence, into points with covariances.
 
     REC is a recording with times of flight; or a tracked sequence of PLUS or Slicer (.igs.mha,
-    .igs.mhd, .igs.nrrd, .seq.nrrd), or a folder of PNG with --poses: then the target is looked for
-    in every frame, and OUT.h5 has those in which it was found (options from --from on).
+    .igs.mhd, .igs.nrrd, .seq.nrrd), or a folder of PNG with --poses: then every frame is searched
+    for the target, and OUT.h5 has the frames in which it was found (options from --from on).
 
-    Of a recording OUT.h5 holds everything jaxcal reads from REC, the times of flight included, with
-    the points beside them; "jaxcal calibrate" then uses the points. Frames with too few answers are
-    masked out and counted. The points of a curvilinear probe are the in-plane fit; what its times
-    say of the elevation, which has no sign, is written to the group segmentation.
+    For a recording, OUT.h5 holds everything that jaxcal reads from REC, including the times of
+    flight, and the points in addition; "jaxcal calibrate" then uses the points. Frames with too few
+    answers are masked out and counted. The points of a curvilinear probe are fitted in the image
+    plane; the size of the elevational offset by its times (without a sign) is written to the group
+    segmentation.
     """
     of_frames = _is_of_frames(recording)
     others = _TIMES if of_frames else tuple(frames)
@@ -216,7 +217,7 @@ def _segment_frames(source: str, out: str | None, as_json: bool, options: dict[s
         again = given_options(options, orientation=True)
         later = ", and import them with --lag auto" if options["lag_s"] == "auto" else ""
         lines += [
-            "- few show a credible target: look at --region and --target, or place the points by "
+            "- few show a credible target: check --region and --target, or place the points by "
             f"hand{later}:",
             Verbatim("  " + shlex.join(["jaxcal", "pick", source, *again])),
         ]

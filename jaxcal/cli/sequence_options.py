@@ -42,7 +42,10 @@ _TRACKING = (
         "--from", "source", metavar="FRAME", help="Tracked frame on the probe, e.g. Probe."
     ),
     click.option(
-        "--to", "target", metavar="FRAME", help="Frame the target rests in, e.g. Reference."
+        "--to",
+        "target",
+        metavar="FRAME",
+        help="Frame in which the target does not move, e.g. Reference.",
     ),
     click.option(
         "--poses",
@@ -78,7 +81,7 @@ _TABLES = (
     click.option(
         "--pose-units",
         type=click.Choice(["mm", "cm", "m"]),
-        help="Unit of translations where the file of the poses does not say; mm by default.",
+        help="Unit of translations if the file of the poses does not say it; mm by default.",
     ),
     quaternion_option,
     click.option(

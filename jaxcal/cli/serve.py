@@ -23,8 +23,8 @@ from jaxcal.cli.common import POSITIVE, ExitCode
 def serve(calibration: str, host: str, port: int, rate: float, name: str) -> int:
     """Serve the calibration CAL as an OpenIGTLink TRANSFORM until Ctrl-C.
 
-    In Slicer: OpenIGTLinkIF, a connector as client to this host and port. The matrix is PLUS's
-    ImageToProbe, with the pixel size in it: leave the image's own spacing at 1.
+    In Slicer's OpenIGTLinkIF, add a connector of type client for this host and port. The matrix is
+    PLUS's ImageToProbe, with the pixel size in it: leave the image's own spacing at 1.
     """
     from jaxcal.io.serving import TransformServer
     from jaxcal.result.saved import load_calibration

@@ -60,7 +60,7 @@ def simulate(
     clock_mhz: float | None,
     seed: int,
 ) -> int:
-    """Simulate an experiment after the paper's section 3.1 and write it to OUT.h5.
+    """Simulate an experiment like that of the paper's section 3.1 and write it to OUT.h5.
 
     The file holds the calibration images, noise-free test images and the truth. Calibration images
     are points, or times of flight with --raw and of curvilinear probes; test images are points.

@@ -45,7 +45,7 @@ def study() -> None:
 def run(spec: str, out: str, resume: bool, workers: int | None, dask: str | None) -> int:
     """Compute the study that SPEC.toml describes into DIR, chunk by chunk.
 
-    Interrupted or killed, it is continued with --resume: at most the chunks in work are lost.
+    If it is interrupted or killed, --resume continues it: at most the chunks in progress are lost.
     """
     if workers is not None and dask is not None:
         raise click.UsageError("--workers and --dask exclude each other")

@@ -101,7 +101,7 @@ class Problem:
     def cleared(self, used: Float[AnyArray, "*batch n"]) -> Problem:
         """The problem with harmless values in images that are not used: NaN times 0 is NaN, not 0.
 
-        So are the distances of elements that heard nothing. The mask and all shapes stay as they
+        So are the distances of elements that received nothing. The mask and all shapes stay as they
         are.
 
         Args:

@@ -314,8 +314,8 @@ def _peak(lags: np.ndarray, correlation: np.ndarray, samples: int) -> Latency:
     for other in tops:
         if other != best and strength[other] > _RIVAL * strength[best]:
             raise InputError(
-                f"lags of {lags[best]:.3f} and {lags[other]:.3f} s fit alike: move the probe less "
-                "regularly"
+                f"lags of {lags[best]:.3f} and {lags[other]:.3f} s fit equally well: move the "
+                "probe less regularly"
             )
     # Interpolation between samples makes kinks of the size of a step, so the parabola is wider.
     step = lags[1] - lags[0]
@@ -323,7 +323,7 @@ def _peak(lags: np.ndarray, correlation: np.ndarray, samples: int) -> Latency:
     near = slice(best - half, best + half + 1)
     bend, slope, top = np.polyfit(lags[near] - lags[best], strength[near], 2)
     if bend >= 0:
-        raise InputError("the best lag is no peak: move the probe farther or faster")
+        raise InputError("the correlation has no clear peak: move the probe farther or faster")
     shift = float(np.clip(-slope / (2 * bend), -half * step, half * step))
     # With unit signals, the lag's variance is that of the misfit, (1 - r^2) / n, divided by the
     # power of the slope, (-r'' / r) r^2.

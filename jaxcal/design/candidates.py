@@ -85,8 +85,8 @@ class Candidates:
         if np.linalg.norm(seen - nearest, axis=1).min() > _NEAR_MM:
             raise InputError(
                 f"at none of the candidate poses is the target within {_NEAR_MM:g} mm of the "
-                "image region: are they probe -> tracker, in mm, and do the model's X and target "
-                "go with them?"
+                "image region: are they probe -> tracker, in mm, and do they belong to the "
+                "model's X and target?"
             )
         # Copies with other SDs, or with some of the poses, need no new check.
         object.__setattr__(self, "_checked", True)

@@ -27,7 +27,7 @@ def images_to(
     tre_mm: float,
     candidates: Candidates | None = None,
 ) -> int:
-    """How many more images a wanted target registration error takes.
+    """How many more images are needed for a wanted target registration error.
 
     Args:
         result: a plan, whose poses come first and which is then continued; or a calibration of

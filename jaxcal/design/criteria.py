@@ -90,7 +90,7 @@ def gain(
     weight: Float[AnyArray, "p p"],
     model: Model,
 ) -> Float[Array, ""]:
-    """By how much one more image at a pose lowers tr(W S), mm^2 (JAX; differentiable in the pose).
+    """How much one more image at a pose reduces tr(W S), mm^2 (JAX; differentiable in the pose).
 
     Args:
         pose: probe -> tracker, mm.

@@ -74,7 +74,7 @@ def simulate_errors(
     trials: int = 1000,
     seed: int = 0,
 ) -> SimulatedErrors:
-    """What calibrations of simulated images at these poses are off by.
+    """Errors of calibrations from simulated images at these poses.
 
     The first call compiles the method for a batch, which takes most of its time.
 

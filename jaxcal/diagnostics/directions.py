@@ -41,7 +41,7 @@ def direction_in_words(vector: AnyArray, blocks: tuple[str, ...]) -> str:
     )
     words = [_block_in_words(block, parts[block]) for block in named]
     if "point" in leading and "point" not in named:
-        words.append("the target moving along")
+        words.append("motion of the target")
     return " with ".join([words[0], " and ".join(words[1:3])] if words[1:] else words)
 
 

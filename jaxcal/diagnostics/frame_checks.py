@@ -189,7 +189,7 @@ def _slips(data: ImageData) -> Iterator[tuple[str, dict[str, np.ndarray]]]:
         {"rotations": turned, "translations": back},
     )
     yield (
-        "the poses' rotations are transposed (columns for rows, or conjugate quaternions): "
+        "the poses' rotations are transposed (columns read as rows, or conjugate quaternions): "
         "transpose the 3x3 blocks",
         {"rotations": turned},
     )
@@ -199,15 +199,15 @@ def _slips(data: ImageData) -> Iterator[tuple[str, dict[str, np.ndarray]]]:
         ("last but is read as first", "xyzw", [3, 0, 1, 2]),
     ):
         yield (
-            f"the quaternions' scalar stands {words}: correct the header where it names the "
-            f"columns, else import with --quaternion {right}",
+            f"the quaternions' scalar is {words}: correct the header if it names the columns, "
+            f"otherwise import with --quaternion {right}",
             {"rotations": rotations_from_quaternions(quaternions[:, order], "xyzw")},
         )
     for axis, name in enumerate("xyz"):
         signs = np.where(np.arange(3) == axis, -1.0, 1.0)
         yield (
             f"the poses' translations have the wrong sign along {name} (a left-handed frame, "
-            "converted by half?): reverse it",
+            "only partly converted?): reverse it",
             {"translations": shifts * signs},
         )
     for order, name in (

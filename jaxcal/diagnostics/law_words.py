@@ -1,4 +1,4 @@
-"""The law of the offsets in words, as the answer weighed it and as the offsets turned out."""
+"""The distribution of the offsets in words: as estimated, and as the offsets look."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from jaxcal.result.calibration import Calibration
 
 _FAMILY = {
-    "uniform": "uniform between edges",
-    "bell": "bell-shaped between edges",
+    "uniform": "uniform with sharp limits",
+    "bell": "bell-shaped with sharp limits",
     "gaussian": "Gaussian",
     "student": "heavy-tailed",
 }
@@ -32,14 +32,17 @@ def offset_law(result: Calibration) -> dict[str, object] | None:
     }
     own = float(law.own_probability)
     mean_probability = float(law.mean_probability)
-    words, wrong = "The laws of the offsets could not be weighed; they are taken for Gaussian", None
+    words, wrong = (
+        "The distributions of the offsets could not be compared; Gaussian is assumed",
+        None,
+    )
     if weighed:
         wrong = _contradicted(result)
         words = _law_in_words(probability, wrong)
         if mean_probability > 0.5:
             words += f", about a mean of {float(law.mean):.2f} +- {float(law.mean_sd):.2f} mm"
         noise = "each image's own covariance" if own > 0.5 else "the same SDs in all images"
-        words += f". The measurements' errors have {noise}"
+        words += f". The measurement errors are weighted by {noise}"
     words += "."
     return {
         "weighed": weighed,
@@ -66,11 +69,11 @@ def _law_in_words(probability: dict[str, float], wrong: list[str]) -> str:
     named = [(name, p) for name, p in ranked if p >= 0.1]
     told = " or ".join(f"{_FAMILY[name]} ({100 * p:.0f} %)" for name, p in named)
     if not wrong or any(name not in wrong for name, _ in named):
-        return f"Of the laws that were compared, the data prefer offsets that are {told}"
+        return f"Of the distributions of the offsets that were compared, the data prefer: {told}"
     fitting = [words for name, words in _FAMILY.items() if name not in wrong]
     if not fitting:
-        return f"None of the laws that were compared fits the offsets; the least bad is {told}"
+        return f"None of the distributions compared fits the offsets; the least bad is {told}"
     return (
-        f"The estimate rests on offsets that are {told}, but as they turn out they look "
+        f"The estimate assumes offsets that are {told}, but the estimated offsets look "
         f"{' or '.join(fitting)}"
     )

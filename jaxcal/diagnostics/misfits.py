@@ -57,9 +57,9 @@ def misfits(result: Calibration) -> list[str]:
                 "targets, or a second echo?"
             )
         if abs(skewness) > MISFIT_SCORE:
-            found.append(f"the {name} lean to one side")
+            found.append(f"the {name} are skewed to one side")
         if depth > MISFIT_SCORE:
-            found.append(f"the {name} grow with depth; the noise model takes them for equal")
+            found.append(f"the {name} grow with depth; the noise model assumes that they do not")
         found += _in_time(name, scores[:, k], int(result.images_used))
     return found
 
@@ -79,9 +79,7 @@ def _in_time(name: str, scores: AnyArray, count: int) -> list[str]:
     drift, trend = (float(scores[MISFITS.index(kind)]) for kind in ("drift", "trend"))
     parts = []
     if drift > DRIFT_SCORE:
-        parts.append(
-            f"are alike in successive images (correlation {drift / (count - 1) ** 0.5:.2f})"
-        )
+        parts.append(f"are correlated in successive images ({drift / (count - 1) ** 0.5:.2f})")
     if abs(trend) > DRIFT_SCORE:
         correlation = np.tanh(trend / np.sqrt(count - 3))
         parts.append(f"drift in the course of the recording (correlation {correlation:.2f})")

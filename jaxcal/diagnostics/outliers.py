@@ -137,6 +137,6 @@ def suspects_in_words(result: Calibration) -> list[str]:
         return []
     listed = ", ".join(told) + (", ..." if len(runs) > 10 else "")
     return [
-        f"suspicious images, too far off for chance and not far enough to be left out: {listed}; "
-        "look at them"
+        f"suspicious images: {listed}; their errors are too large for chance, but not large "
+        "enough to leave them out: check them"
     ]

@@ -36,7 +36,7 @@ def warnings(result: Calibration) -> list[str]:
     """
     check_one(result)
     if result.status == "failed":
-        return ["the solve failed: its result holds no usable numbers"]
+        return ["the solve failed: the result holds no usable numbers"]
     if result.wrong_frames is not None:
         # The answer has no meaning, so no other warning is of use.
         return [result.wrong_frames]
@@ -90,10 +90,10 @@ def _only_the_bound(result: Calibration) -> list[str]:
     if result.prior != "bounded" or not from_prior:
         return []
     resting = int(np.sum(result.at_bound > 0))
-    held = f"{resting} of {int(result.images_used)} images rest on it"
+    held = f"{resting} of {int(result.images_used)} images are at the bound"
     if resting == 0:
-        held = "no image rests on it, so any value in an interval fits equally well"
-    return [f"{from_prior} is fixed by nothing but the bound on the offsets: {held}"]
+        held = "no image is at the bound, so any value in an interval fits equally well"
+    return [f"{from_prior} is determined by nothing but the bound on the offsets: {held}"]
 
 
 def _odd_start_or_end(result: Calibration) -> list[str]:
@@ -102,7 +102,7 @@ def _odd_start_or_end(result: Calibration) -> list[str]:
     if result.searched_start:
         found.append(
             "the closed-form start was unusable (degenerate poses or points, or too few images for "
-            "their noise); the start was searched for among 24 rotations"
+            "their noise); a start was found by trying 24 rotations"
         )
     if result.method == "alternating" and result.tolerance_met and result.stationarity > STEADY:
         found.append(
@@ -119,14 +119,16 @@ def _sds_not_tuned(result: Calibration) -> list[str]:
     if result.prior in TUNED and not result.sigma_tuned:
         text = "noise SDs were held fixed, not estimated"
         if used < MINIMUM_SELF_TUNING:
-            text += f": {used} images are fewer than the {MINIMUM_SELF_TUNING} that it takes"
+            text += f": this takes at least {MINIMUM_SELF_TUNING} images, and {used} are used"
         found.append(text)
     if np.any(result.sigma_floored):
         errors = zip(("lateral", "range", "elevational"), result.sigma_floored, strict=True)
         names = [name for name, floored in errors if floored]
         rest = "error is" if len(names) == 1 else "errors are"
-        owner = "its SD rests on its floor" if len(names) == 1 else "their SDs rest on their floors"
-        found.append(f"the {' and '.join(names)} {rest} too small to estimate; {owner}")
+        owner = "its SD is" if len(names) == 1 else "their SDs are"
+        found.append(
+            f"the {' and '.join(names)} {rest} too small to estimate; {owner} at the lower limit"
+        )
     return found
 
 
@@ -138,11 +140,12 @@ def _weak_elevation(result: Calibration) -> list[str]:
     if not sd > WEAK_TRANSLATION_MM:
         return []
     law = result.offset_law
-    on = "a mean of the offsets that the data hardly show"
+    on = "a mean of the offsets that the data hardly determine"
     if law is None or not law.mean_probability > 0.5:
-        on = "offsets that average zero"
+        on = "the assumption that the offsets average zero"
     return [
-        f"translation along the elevational axis is weakly seen (SD {sd:.2f} mm) and rests on {on}"
+        f"translation along the elevational axis is weakly determined (SD {sd:.2f} mm) and rests "
+        f"on {on}"
     ]
 
 
@@ -182,7 +185,7 @@ def _weak_direction(result: Calibration) -> list[str]:
         return []
     only = ""
     if result.prior != "none" and abs(float(result.weakest @ result.prior_direction)) > 0.7:
-        only = ", known only from what is believed of the offsets"
+        only = ", known only from the assumed distribution of the offsets"
     return [
         f"weakly determined: {sight['weakest_direction']} (SD {sd:.1f} mm at the target{only}); "
         f"{sight['advice']}"
@@ -218,8 +221,8 @@ def _medium_warnings(result: Calibration) -> list[str]:
         shown = f"{factor * float(value):.4g} +- {factor * float(sd):.2g} {unit}"
         if believed is not None and float(sd) > WEAK_SHARE * float(believed):
             found.append(
-                f"the {name} is hardly seen in these data: {shown} is little more than what was "
-                f"believed before (SD {factor * float(believed):.2g} {unit})"
+                f"these data hardly determine the {name}: {shown} is little better than its prior "
+                f"(SD {factor * float(believed):.2g} {unit})"
             )
         elif believed is None and name == "delay":
             found.append(

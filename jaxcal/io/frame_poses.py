@@ -26,7 +26,7 @@ def open_sequence(
         InputError: files that cannot be read or do not belong together; one line.
     """
     if options.poses is None or kind_of(options.poses) != "table":
-        refuse(options, ("quaternion", "skip_invalid"), "is for tables, and none is read")
+        refuse(options, ("quaternion", "skip_invalid"), "is for tables, but no table is read")
     sequence, tracking, notes = opened(source, options)
     if tracking is None:
         return sequence, notes
@@ -41,7 +41,7 @@ def opened(
 ) -> tuple[TrackedSequence, Tracking | None, list[str]]:
     """A sequence, and the poses that are to be matched to it by time, if there are such."""
     if options.poses is None:
-        refuse(options, ("lag_s",), "needs --poses: it is between images and poses of two files")
+        refuse(options, ("lag_s",), "needs --poses: a lag is between images and poses of two files")
         return read_tracked(source, options.pose_units), None, []
     sequence = read_tracked(source)
     of_table = kind_of(options.poses) == "table"

@@ -158,7 +158,7 @@ class CheckedFile(io.RawIOBase):
         self._bytes_left -= size
         self._objects_left -= objects
         if self._bytes_left < 0 or self._objects_left < 0:
-            raise FormatError("is damaged: absurdly many heaps of text")
+            raise FormatError("is damaged: too many heaps of text")
 
 
 def _lock(descriptor: int) -> None:

@@ -200,7 +200,7 @@ def _refuse_unused(points: str | os.PathLike[str] | None, options: ImportOptions
     """Refuse options that a sequence with these points does not use."""
     kinds = [None if source is None else kind_of(source) for source in (points, options.poses)]
     if "table" not in kinds:
-        refuse(options, ("quaternion", "skip_invalid"), "is for tables, and none is read")
+        refuse(options, ("quaternion", "skip_invalid"), "is for tables, but no table is read")
     if kinds[0] != "table":
         refuse(options, ("units",), "is for tables of points, and none is read")
     if points is None:

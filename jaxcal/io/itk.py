@@ -150,7 +150,7 @@ def _read_text(path: str | os.PathLike[str]) -> tuple[str, np.ndarray, np.ndarra
     first = True
     for line, content in text_lines(path, comments=True):
         if first and not content.startswith(_HEAD):
-            raise FormatError("is not an ITK transform: its first line is another")
+            raise FormatError("is not an ITK transform: its first line does not say so")
         first = False
         if content.startswith("#"):
             continue
@@ -178,7 +178,7 @@ def _read_hdf5(root: Node) -> tuple[str, np.ndarray, np.ndarray]:
             "first: jaxcal calibrate)"
         )
     if child(transforms, "1") is not None:
-        raise FormatError("holds several transforms; one is read")
+        raise FormatError("holds several transforms; it must hold only one")
     one = group(transforms, "0")
     if one is None:
         raise FormatError("holds no transform")
@@ -187,6 +187,6 @@ def _read_hdf5(root: Node) -> tuple[str, np.ndarray, np.ndarray]:
     parameters = child(one, "TransformParameters") or child(one, "TranformParameters")
     fixed = child(one, "TransformFixedParameters") or child(one, "TranformFixedParameters")
     if parameters is None or fixed is None or kind is None:
-        raise FormatError(f"{one} is not whole")
+        raise FormatError(f"{one} is incomplete")
     some = (UpTo(99, "numbers"),)
     return string(kind), array(parameters, some), array(fixed, some)

@@ -47,7 +47,7 @@ def read_metaimage(path: Path, name: str) -> TrackedSequence:
         if header.take_frame_field(key, value, line):
             continue
         if header.fields.get(key, value) != value:
-            raise FormatError(f"line {line}: {quoted(key)} stands there twice, and differs")
+            raise FormatError(f"line {line}: {quoted(key)} is given twice, with different values")
         header.fields[key] = value
         if key == "ElementDataFile":
             header.end = end
@@ -122,7 +122,7 @@ def _after_header(stated: str, data: str, pixels: Pixels, count: int) -> int:
     """Where pixels begin in their file, by HeaderSize: -1 says that they are its end."""
     if data == "LOCAL":
         raise FormatError(
-            f"HeaderSize = {quoted(stated)}: is read only for pixels in another file, and they "
+            f"HeaderSize = {quoted(stated)}: applies only to pixels in another file, but these "
             "follow the header: remove the line"
         )
     if stated != "-1":
@@ -131,7 +131,9 @@ def _after_header(stated: str, data: str, pixels: Pixels, count: int) -> int:
             raise FormatError(f"HeaderSize must be one number, not {quoted(stated)}")
         return numbers[0]
     if pixels.packing != "raw":
-        raise FormatError("HeaderSize = -1: is for raw pixels: state where the packed ones begin")
+        raise FormatError(
+            "HeaderSize = -1: is for raw pixels: state where the compressed ones begin"
+        )
     # A file that is too short is told from its size.
     return max(pixels.path.stat().st_size - pixels.frame_bytes * count, 0)
 

@@ -61,7 +61,7 @@ def read_nrrd(path: Path, name: str) -> TrackedSequence:
         else:
             raise FormatError(f"line {line} is not a field: {quoted(text)}")
         if header.fields.get(key, value) != value:
-            raise FormatError(f"line {line}: {quoted(key)} stands there twice, and differs")
+            raise FormatError(f"line {line}: {quoted(key)} is given twice, with different values")
         header.fields[key] = value
     fields = header.fields
     if not header.end:

@@ -54,7 +54,9 @@ def check_output(
     except (OSError, ValueError):
         status = None
     if status is not None and any(_same(status, each) for each in inputs):
-        raise InputError(f"{name}: is read by this command and not replaced: name another output")
+        raise InputError(
+            f"{name}: is an input of this command and is not replaced: name another output"
+        )
     if not name.lower().endswith(endings):
         raise InputError(f"{name}: {what} is named {' or '.join(endings)}")
     if status is None or not stat.S_ISREG(status.st_mode) or status.st_size == 0:

@@ -42,7 +42,7 @@ class PixelStream:
             raise FormatError(f"the pixels cannot be read: {one_line(error)}") from None
         most, packed = stored, ""
         if packing != "raw":
-            most, packed = stored * _MOST_INFLATION, f", packed ({packing})"
+            most, packed = stored * _MOST_INFLATION, f", compressed ({packing})"
         if size > most:
             self._file.close()
             raise FormatError(
@@ -100,7 +100,7 @@ class PixelStream:
         if more:
             raise FormatError(f"the pixels inflate beyond their size, {self._size} bytes")
         if not self._inflate.eof:
-            raise FormatError("the pixels are damaged: their packed end is missing")
+            raise FormatError("the pixels are damaged: the end of the compressed data is missing")
 
     def _skip(self, count: int) -> None:
         while count > 0:

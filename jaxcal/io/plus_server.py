@@ -73,12 +73,12 @@ def _reply(link: socket.socket, device: str, due: float) -> bytes:
     while True:
         header = parse_header(_take(link, HEADER_SIZE, due))
         if header is None:
-            raise InputError("what answers does not speak OpenIGTLink")
+            raise InputError("the program there does not speak OpenIGTLink")
         wanted = header.kind == "STRING" and header.device == device
         if wanted and header.size <= _LONGEST_REPLY:
             body = _take(link, header.size, due)
             if crc64.ecma_182(body) != header.crc:
-                raise InputError("the reply was damaged on its way")
+                raise InputError("the reply was damaged in transmission")
             return body
         left = header.size
         while left:

@@ -91,7 +91,7 @@ def with_poses_by_time(
     time, poses, valid, pair, source, length_stated, time_stated = tracking
     if not np.isfinite(images.time).all():
         raise InputError(
-            f"{images.source}: states no times, by which poses of {source} would be found"
+            f"{images.source}: has no times, so its poses cannot be looked up in {source}"
         )
     kept = _increasing(time, source)
     time, poses, valid = time[kept], poses[kept], valid[kept]
@@ -105,7 +105,7 @@ def with_poses_by_time(
         raise InputError(
             f"{images.source}: no image lies between poses of {source}: images are from "
             f"{seconds(asked.min())} to {seconds(asked.max())}, poses from {seconds(time[0])} to "
-            f"{seconds(time[-1])}: are they of one clock?"
+            f"{seconds(time[-1])}: do they use the same clock?"
         )
     found = np.full((len(images), 4, 4), np.nan)
     found[between] = interpolate_poses(time, poses, asked[between], max_gap_s=gap, valid=valid)

@@ -131,7 +131,7 @@ def read_ros_yaml(path: str | os.PathLike[str]) -> Float[np.ndarray, "4 4"]:
         except ValueError:
             raise FormatError(f"{name}:{line}: {key} is not a number: {quoted(text)}") from None
         if key in found or not np.isfinite(value):
-            raise FormatError(f"{name}:{line}: {key} stands there twice, or is not finite")
+            raise FormatError(f"{name}:{line}: {key} is given twice, or is not finite")
         found[key] = value
     missing = [key for key in _KEYS if key not in found]
     if missing:

@@ -282,7 +282,7 @@ def _png_image(pixels: FolderPixels, number: int) -> np.ndarray:
 
     frame = read_png(pixels.paths[number])
     if frame.shape != (pixels.rows, pixels.columns):
-        raise FormatError(f"{pixels.paths[number]}: has another size than when it was looked at")
+        raise FormatError(f"{pixels.paths[number]}: has changed its size while it was being read")
     return frame
 
 

@@ -57,7 +57,7 @@ class SequenceHeader:
             raise FormatError(f"line {line}: frame {number}; at most {MOST_FRAMES} frames are read")
         of_frame = self.frames.setdefault(number, {})
         if found[2] in of_frame:
-            raise FormatError(f"line {line}: {quoted(key)} stands there twice")
+            raise FormatError(f"line {line}: {quoted(key)} is given twice")
         of_frame[found[2]] = (value, line)
         return True
 

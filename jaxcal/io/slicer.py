@@ -68,7 +68,7 @@ def _read_json(path: str | os.PathLike[str]) -> Markups:
     if not isinstance(markups, list) or not markups:
         raise FormatError("holds no markups: save the points from Slicer as Markups JSON")
     if len(markups) > 1 or not isinstance(markups[0], dict):
-        raise FormatError(f"holds {len(markups)} markups; one list of points is read")
+        raise FormatError(f"holds {len(markups)} markups; it must hold only one list of points")
     markup = markups[0]
     if markup.get("coordinateUnits", "mm") not in ("mm", ["mm"], "millimeter"):
         raise FormatError(f"coordinateUnits {quoted(str(markup['coordinateUnits']))} are not mm")

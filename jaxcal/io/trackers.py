@@ -69,7 +69,7 @@ def read_tracker(
             return replace(_read_motive(first, rows, name, pose_units), length_stated=True)
         raise FormatError(
             "is no export of NDI ToolBox or Motive with commas between cells: if a spreadsheet "
-            "has saved it anew, import the file that the tracker's program wrote"
+            "program saved it, import the original file of the tracker's program"
         )
 
 

@@ -402,7 +402,7 @@ def _check_chunks(node: Node, dataset: h5py.Dataset, layout) -> None:
     dataset.id.chunk_iter(lambda info: stored.append((info.size, info.chunk_offset)))
     for size, offset in stored:
         if size > nominal + nominal // 64 + 1024:
-            raise FormatError(f"{node} has a packed chunk larger than its contents")
+            raise FormatError(f"{node} has a compressed chunk larger than its contents")
         if size > _HARMLESS_CHUNK:
             skipped, packed = dataset.id.read_direct_chunk(offset)
             if skipped & (1 << position):
@@ -421,15 +421,15 @@ def _check_filters(node: Node, layout) -> int | None:
         code, _, _, name = layout.get_filter(index)
         if code not in _FILTERS:
             raise FormatError(
-                f"{node} is packed by filter {code} ({quoted(name.decode(errors='replace'))}), "
+                f"{node} is compressed by filter {code} ({quoted(name.decode(errors='replace'))}), "
                 "which is not read: write it with gzip or uncompressed"
             )
         codes.append(code)
     if len(set(codes)) < len(codes):
-        raise FormatError(f"{node} is packed twice by the same filter")
+        raise FormatError(f"{node} is compressed twice by the same filter")
     if h5z.FILTER_DEFLATE not in codes:
         return None
     position = codes.index(h5z.FILTER_DEFLATE)
     if set(codes[position + 1 :]) - {h5z.FILTER_FLETCHER32}:
-        raise FormatError(f"{node} is packed by filters in an order that is not read")
+        raise FormatError(f"{node} is compressed by filters in an order that is not supported")
     return position

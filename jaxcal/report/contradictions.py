@@ -61,7 +61,8 @@ def _from_residuals(record: dict[str, Any]) -> list[tuple[float, str]]:
     ratio, chance = tre["residuals_over_stated"], tre["chance"]
     if ratio is None or chance is None or ratio**2 <= 1 + CHANCE * chance:
         return []
-    return [(ratio, f"the residuals make the error {ratio:.1f} times as large as the covariance")]
+    words = f"the residuals make the error {ratio:.1f} times as large as the covariance does"
+    return [(ratio, words)]
 
 
 def _from_images(record: dict[str, Any]) -> list[tuple[float, str]]:
@@ -70,7 +71,7 @@ def _from_images(record: dict[str, Any]) -> list[tuple[float, str]]:
     held = record.get("cross_validation")
     moved, how = influence["moved_mm"], "to first order"
     if held is not None and held["folds"] == len(moved):
-        moved, how = held["image_moved_mm"], "calibrated anew without it"
+        moved, how = held["image_moved_mm"], "by a calibration without it"
     worst, size = None, 0.0
     for image, (by, should) in enumerate(zip(moved, influence["expected_mm"], strict=True)):
         if by is None or should is None or by <= max(MOVED_SHARE * stated, MOVED_TIMES * should):
@@ -79,7 +80,7 @@ def _from_images(record: dict[str, Any]) -> list[tuple[float, str]]:
             worst, size = image, by
     if worst is None:
         return []
-    words = f"image {worst} alone moves the image by {size:.2f} mm ({how})"
+    words = f"image {worst} alone changes the calibration by {size:.2f} mm in the image ({how})"
     return [(math.hypot(1.0, size / stated), words)]
 
 
@@ -115,7 +116,7 @@ def _from_slow_changes(record: dict[str, Any]) -> list[tuple[float, str]]:
         slow = size * math.sqrt(min(score / math.sqrt(record["images_used"] - 1), 1.0))
         words = (
             f"the points move {name} by {slow:.2f} mm (SD) in the course of the recording, so that "
-            "the image is elsewhere at its end than at its start"
+            "the calibration at its end is not that at its start"
         )
         if slow > stated:
             found.append((math.hypot(1.0, slow / stated), words))
@@ -174,7 +175,7 @@ def _from_left_out(record: dict[str, Any]) -> list[tuple[float, str]]:
     if found is None or not stated:
         return []
     words = (
-        f"the {found['images']} images left out agree among themselves as well, on a calibration "
+        f"the {found['images']} images left out agree among themselves, but on a calibration "
         f"{found['apart_mm']:.1f} mm away: which of the two is right?"
     )
     return [(math.hypot(1.0, found["apart_mm"] / stated), words)]
@@ -183,8 +184,8 @@ def _from_left_out(record: dict[str, Any]) -> list[tuple[float, str]]:
 def _scatter(scatter: float, stated: float) -> str:
     """Of corners and middle of the part of the image in which targets were seen."""
     return (
-        f"scatter by {scatter:.2f} mm where targets were seen, {scatter / stated:.1f} times the "
-        f"{stated:.2f} mm that is stated there"
+        f"scatter by {scatter:.2f} mm where targets were seen, {scatter / stated:.1f} times as "
+        f"much as the covariance states ({stated:.2f} mm)"
     )
 
 
@@ -198,13 +199,13 @@ def _from_resampling(record: dict[str, Any]) -> list[tuple[float, str]]:
         each = len(moved) / folds
         scatter = math.sqrt((folds - 1) / folds * sum(by**2 for by in moved) / each)
         if stated and scatter > SCATTER_TIMES * stated:
-            words = f"calibrations without some of the images {_scatter(scatter, stated)}"
+            words = f"the calibrations of the cross-validation {_scatter(scatter, stated)}"
             found.append((scatter / stated, words))
     if drawn is not None and drawn["stated_mm"]:
         known = [value for value in drawn["reproducibility_mm"] if value is not None]
         scatter = math.sqrt(sum(value**2 for value in known) / max(len(known), 1))
         stated = drawn["stated_mm"]
         if scatter > SCATTER_TIMES * stated:
-            words = f"calibrations from images drawn anew {_scatter(scatter, stated)}"
+            words = f"the calibrations of the bootstrap {_scatter(scatter, stated)}"
             found.append((scatter / stated, words))
     return found

@@ -75,17 +75,15 @@ def next_poses_sentences(record: dict[str, Any]) -> list[str]:
     now, then = found["tre_now_mm"], found["tre_then_mm"]
     # More images do not help against an error that the noise model leaves out.
     beside = bool((record.get("tre") or {}).get("contradictions"))
-    error = "error that the noise model states" if beside else "predicted error"
+    error = "error by the noise model alone" if beside else "predicted error"
     lines = listed(
-        f"What would help most: {len(found['poses'])} images that bring the {error} over "
-        f"the image from {now:.2f} to {then:.2f} mm; from the middle orientation, marker to your "
-        "right",
+        f"What would help most: {len(found['poses'])} images that reduce the {error} from "
+        f"{now:.2f} to {then:.2f} mm. From the middle orientation, with the marker to your right",
         [pose["words"] for pose in found["poses"]],
     )
     if found["images_to_half"] is not None:
         more = found["images_to_half"]
         images = "image" if more == 1 else "images"
-        stays = "; what contradicts the noise model may stay" if beside else ""
-        halving = "Halving the stated error" if beside else "Halving the error"
-        lines.append(f"{halving} takes {more} more {images}, chosen like these{stays}.")
+        stays = "; what contradicts the noise model may remain" if beside else ""
+        lines.append(f"Halving the {error} takes {more} more {images}, chosen like these{stays}.")
     return lines

@@ -54,8 +54,8 @@ LONGEST_LIST = 3000
 _DOCTYPE, _TITLE = "<!DOCTYPE html>", "<title>Calibration of "
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:"
 _KINDS = (
-    ("lateral", "sideways", svg.BLUE),
-    ("range", "depth", svg.GREEN),
+    ("lateral", "lateral", svg.BLUE),
+    ("range", "range", svg.GREEN),
     ("elevational", "out of the plane", svg.ORANGE),
 )
 _FORMS: tuple[tuple[SaveFormat, str, str], ...] = (
@@ -273,20 +273,21 @@ def _accuracy(record: dict[str, Any], answer: Calibration, recording: Recording)
     why = "".join(f"<li>{escape(text)}</li>" for text in tre["contradictions"])
     if why:
         why = (
-            f"<p>The covariance states {_length(record, 'tre.stated_mm', 'mm')}; all "
-            f"numbers here are {_number(record, 'tre.factor', '.2f')} times as large, since</p>"
+            f"<p>The covariance states {_length(record, 'tre.stated_mm', 'mm')}. All "
+            f"numbers here are {_number(record, 'tre.factor', '.2f')} times as large, because</p>"
             f"<ul>{why}</ul>"
         )
     return _section(
         "How accurate",
         '<div class="grid"><figure>',
         drawn,
-        "<figcaption>Distance to expect between the true and the calibrated place of what is seen "
-        "at a point of the image. Dots: where the target was.</figcaption></figure><div>",
+        "<figcaption>Distance to expect between the true position of what is seen at a point of "
+        "the image and its position by this calibration. Dots: where the target was."
+        "</figcaption></figure><div>",
         _table(rows, head),
         why,
-        '<p class="soft">Half of the intervals\' remaining 5 % lies below, half above. Errors of '
-        "the tracker at the time of use, and of reading a point, come on top.</p></div></div>",
+        '<p class="soft">Each interval leaves 2.5 % below and 2.5 % above. When you use the '
+        "calibration, errors of the tracker and of the point you pick are added.</p></div></div>",
     )
 
 
@@ -363,8 +364,8 @@ def _scene(record: dict[str, Any], answer: Calibration, recording: Recording) ->
         (
             close,
             "scene-target",
-            "The target as each image puts it (green; does not fit the rest: orange), and the "
-            f"estimate{ellipsoid}.",
+            "The target's position by each image (green; orange: an image that does not fit the "
+            f"rest), and its estimate{ellipsoid}.",
         ),
     )
     parts = [
@@ -458,24 +459,25 @@ def _residuals(record: dict[str, Any], answer: Calibration) -> str:
     spread = ", with one standard deviation (grey)" if known else ""
     parts = [
         f"<figure>{first}<figcaption>Residual of every image, one scale for all: the estimated "
-        "target less the measured point taken in the plane. Rings: does not fit the rest."
+        "target less the measured point, taken in the image plane. Rings: images that do not fit "
+        "the rest."
         "</figcaption></figure>",
-        f"<figure>{second}<figcaption>How far the target was out of the image plane{spread}."
-        "</figcaption></figure>",
+        f"<figure>{second}<figcaption>Estimated distance of the target from the image plane{spread}"
+        ".</figcaption></figure>",
     ]
     influence = record["influence"]
     if influence is not None:
         moved = influence["moved_mm"]
         shown = [int(k) for k in used if moved[int(k)] is not None]
         third = svg.series(
-            [("moves it (mm)", shown, [moved[k] for k in shown], svg.BLUE)],
+            [("change (mm)", shown, [moved[k] for k in shown], svg.BLUE)],
             influence["most"][:3],
-            "How far leaving out an image would move the calibration, mm at the image",
+            "How far leaving out an image would change the calibration, mm in the image",
             height=120.0,
         )
         parts[1] += (
-            f"<figure>{third}<figcaption>Which images hurt: how far the image would move if one of "
-            "them were left out (to first order). Rings: the three that move it most."
+            f"<figure>{third}<figcaption>How far points of the image would move if one image were "
+            "left out (to first order). Rings: the three images with the largest effect."
             "</figcaption></figure>"
         )
     words = _paragraphs(resampled_sentences(record))
@@ -487,8 +489,8 @@ def _limits(record: dict[str, Any]) -> str:
     found = record["limits"]
     rows = []
     for title, name in (
-        ("Mean square error of the calibration at the image", "error_share"),
-        ("Mean square distance of the target from its place", "scatter_share"),
+        ("Mean square error of the calibration in the image", "error_share"),
+        ("Mean square residual of the target", "scatter_share"),
     ):
         shares = [(word, found[name][kind], colour) for kind, word, colour in _KINDS]
         if all(share is not None for _, share, _ in shares):
@@ -496,8 +498,8 @@ def _limits(record: dict[str, Any]) -> str:
     sds = " ".join(
         f"{word} {_length(record, f'sigma_{name}_mm', 'mm')}{mark}"
         for word, name, mark in (
-            ("sideways", "lateral", ","),
-            ("depth", "range", ","),
+            ("lateral", "lateral", ","),
+            ("range", "range", ","),
             ("out of the plane", "elevation", "."),
         )
     )
@@ -508,8 +510,8 @@ def _limits(record: dict[str, Any]) -> str:
         f"{_number(record, 'rms_mm', '.3f', 'mm')}, of which "
         f"{_number(record, 'limits.rms_in_plane_mm', '.3f', 'mm')} in the image plane and "
         f"{_number(record, 'limits.rms_elevational_mm', '.3f', 'mm')} out of it.</p>",
-        '<p class="soft">The upper bar is about the calibration; the lower one about how the '
-        "target was imaged and read, which no calibration removes.</p>",
+        '<p class="soft">The upper bar is about the calibration. The lower one is about how the '
+        "target was imaged and picked, which no calibration can improve.</p>",
     )
 
 
@@ -524,7 +526,7 @@ def _comparison(record: dict[str, Any]) -> str:
     rows = [
         ("residual, root mean square (mm)", number("conventional_rms_mm"), number("rms_mm")),
         (
-            "error at the image by the noise found (mm)",
+            "expected error from the estimated noise (mm)",
             number("conventional_tre_mm"),
             number("tre_mm"),
         ),
@@ -533,7 +535,7 @@ def _comparison(record: dict[str, Any]) -> str:
         gain = f"{number('log_density_gain', '+.1f')} ± {number('log_density_gain_sd', '.1f')}"
         rows.append(("images left out, log density", "0", gain))
     return _section(
-        "Beside the conventional fit",
+        "Comparison with the conventional fit",
         _table(rows, ("", "conventional", escape(record["method"]))),
         _paragraphs(believe(record)),
     )
@@ -541,7 +543,7 @@ def _comparison(record: dict[str, Any]) -> str:
 
 def _observability(record: dict[str, Any]) -> str:
     sight = record["observability"]
-    words = [f"Least known: {sight['weakest_direction']}."]
+    words = [f"Least well determined: {sight['weakest_direction']}."]
     if _usable(record):
         words += certainty(record)
     proved = certificate_words(record)

@@ -213,7 +213,7 @@ def plot_influence(calibration: Calibration) -> Figure:
             ha="center",
             fontsize=7,
         )
-    panel.set(xlabel="image", ylabel="moves the image by (mm)", ylim=(0.0, None))
+    panel.set(xlabel="image", ylabel="change in the image (mm)", ylim=(0.0, None))
     panel.margins(y=0.12)
     _legend(panel)
     return figure
@@ -230,7 +230,7 @@ def plot_limits(calibration: Calibration) -> Figure:
     shares = error_shares(answer, influence_of(answer), weight)
     figure = canvas(PAGE_MM, 38.0)
     panel = styled(figure.subplots())
-    rows = ("distance of the target\nfrom its place", "error of the calibration\nat the image")
+    rows = ("residual of\nthe target", "error of the calibration\nin the image")
     for row, values in enumerate((scatter_shares(answer), shares)):
         left = 0.0
         for kind, share in zip(KINDS, values, strict=True):

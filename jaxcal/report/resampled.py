@@ -61,7 +61,7 @@ def resampled_sentences(record: dict[str, Any]) -> list[str]:
     held = record.get("cross_validation")
     if held is not None and held["precision_mm"] is not None:
         lines.append(
-            f"On images that were not used for it, the calibration is as precise as "
+            f"On images that were not used for the calibration, the reconstruction precision is "
             f"{held['precision_mm']:.2f} mm ({held['folds']}-fold cross-validation)."
         )
         strong = [
@@ -72,16 +72,16 @@ def resampled_sentences(record: dict[str, Any]) -> list[str]:
         if strong:
             first = strong[0]
             lines.append(
-                f"Image {first} alone moves it by {held['influence'][first]:.1f} of its standard "
-                "deviations: look at that image."
+                f"Image {first} alone changes the calibration by {held['influence'][first]:.1f} of "
+                "its standard deviations: check this image."
             )
     drawn = record.get("bootstrap")
     if drawn is not None and drawn["reproducibility_mm"][-1] is not None:
         worst = max(value for value in drawn["reproducibility_mm"] if value is not None)
         turned = math.sqrt(sum((value or 0.0) ** 2 for value in drawn["rotation_sd_deg"]))
         lines.append(
-            f"Calibrated {drawn['resamples']} times from images drawn anew, a point in the middle "
-            f"of the image scatters by {drawn['reproducibility_mm'][-1]:.2f} mm, at the worst "
-            f"corner by {worst:.2f} mm, and the orientation by {turned:.2f} degrees."
+            f"In {drawn['resamples']} bootstrap calibrations, a point in the middle of the image "
+            f"scatters by {drawn['reproducibility_mm'][-1]:.2f} mm, the worst corner by "
+            f"{worst:.2f} mm, and the orientation by {turned:.2f} degrees."
         )
     return lines

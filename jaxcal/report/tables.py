@@ -109,7 +109,10 @@ def _facts(record: dict[str, Any]) -> list[tuple[str, str]]:
     # If the direction is not determined at all, the SD only shows where rounding begins.
     sd = sight["weakest_sd_mm"] if record["status"] != "unobservable" else None
     facts.append(
-        ("least known", sight["weakest_direction"] + ("" if sd is None else f" (SD {sd:.2f} mm)"))
+        (
+            "least well determined",
+            sight["weakest_direction"] + ("" if sd is None else f" (SD {sd:.2f} mm)"),
+        )
     )
     if "truth_error" in record:
         error = record["truth_error"]

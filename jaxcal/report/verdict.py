@@ -24,8 +24,8 @@ _MORE_VARIED = (
     "the target in all parts of the image, near and far, left and right."
 )
 _KINDS = {
-    "lateral": "sideways errors of the points",
-    "range": "errors of their depth",
+    "lateral": "lateral errors of the points",
+    "range": "range errors of the points",
     "elevational": "targets out of the image plane",
 }
 
@@ -60,8 +60,8 @@ def headline(record: dict[str, Any]) -> str:
         return "Do not trust: the solver stopped before it converged."
     if tre is None or tre.get("rms_mm") is None:
         return (
-            f"Uncertain: solved from {record['images_used']} images, which do not tell how far off "
-            "the image is."
+            f"Uncertain: solved from {record['images_used']} images, which do not show how large "
+            "the error is."
         )
     low, high = tre["interval_95_mm"]
     return (
@@ -87,8 +87,8 @@ def why_larger(record: dict[str, Any]) -> list[str]:
     if tre is None or not tre.get("contradictions"):
         return []
     return [
-        f"The noise model by itself states {_mm(tre['stated_mm'])}, but "
-        f"{'; '.join(tre['contradictions'])}. That much more is to be expected."
+        f"By the noise model alone the error would be {_mm(tre['stated_mm'])}, but "
+        f"{'; '.join(tre['contradictions'])}. The error above includes this."
     ]
 
 
@@ -101,7 +101,7 @@ def where(record: dict[str, Any]) -> list[str]:
     # The mean square error is convex, so that it is largest in a corner; it is smallest anywhere.
     worst = max(named.values(), key=lambda point: point["tre_mm"])
     lines = [
-        f"{_place(named['middle']).capitalize()}: {_mm(named['middle']['tre_mm'])}. Worst: "
+        f"In {_place(named['middle'])} it is {_mm(named['middle']['tre_mm'])}; at worst, in "
         f"{_place(worst)}, {_mm(worst['tre_mm'])}."
     ]
     for point in tre["points"]:
@@ -129,14 +129,14 @@ def limits(record: dict[str, Any]) -> list[str]:
     lines = []
     if tre.get("contradictions"):
         lines.append(
-            "First of all what contradicts the noise model, as said above; the rest of this list "
-            "is about the error that the noise model states."
+            "Most of all, what contradicts the noise model (see above). The rest of this list is "
+            "about the error by the noise model alone."
         )
     shares = {kind: share for kind, share in found["error_share"].items() if share is not None}
     if shares:
         ranked = sorted(shares.items(), key=lambda item: -item[1])
         named = [f"{_KINDS[kind]} ({100 * share:.0f} %)" for kind, share in ranked if share >= 0.1]
-        lines.append(f"{', then '.join(named).capitalize()} make its mean square error.")
+        lines.append(f"The mean square error comes mainly from {' and '.join(named)}.")
     poses = _poses(record)
     if poses:
         lines.append(poses)
@@ -149,12 +149,14 @@ def limits(record: dict[str, Any]) -> list[str]:
         ]
         if strong:
             told = ", ".join(f"{image} ({_mm(moved)})" for image, moved in strong[:3])
-            lines.append(f"Images that move it most when they are left out: {told}.")
+            lines.append(
+                f"Leaving out one of these images would change the calibration most: {told}."
+            )
     return lines
 
 
 def scatter(record: dict[str, Any]) -> list[str]:
-    """Why the target scatters; this scatter is not the error of the calibration."""
+    """Why the target scatters, which is not the error of the calibration."""
     found = record.get("limits")
     if found is None or record.get("tre") is None:
         return []
@@ -166,28 +168,28 @@ def scatter(record: dict[str, Any]) -> list[str]:
         ""
         if precision is None
         else (
-            f", {_mm(precision)} by Eq. 8 over the {record['reconstruction_precision_set']} images"
-            f"{counted}"
+            f"; reconstruction precision (Eq. 8) over the {record['reconstruction_precision_set']} "
+            f"images{counted}: {_mm(precision)}"
         )
     )
     ranked = sorted(found["scatter_share"].items(), key=lambda item: -(item[1] or 0.0))
-    told = [f"{_KINDS[kind]} {100 * share:.0f} %" for kind, share in ranked if share is not None]
+    told = [f"{100 * share:.0f} % {_KINDS[kind]}" for kind, share in ranked if share is not None]
     tre, within = record["tre"], record["rms_mm"] or 0.0
     if (tre["rms_mm"] or 0.0) < within:
         means = (
-            "That is how the images were taken and read, which no calibration removes; the "
-            "calibration's own error is the smaller number above."
+            "This scatter comes from how the images were taken and read, and no calibration "
+            "removes it; the calibration's own error is the smaller number above."
         )
     elif (tre["stated_mm"] or 0.0) < within:
         means = "The error to expect is larger because of what contradicts the noise model."
     else:
         means = (
-            "The images agree with each other better than the calibration is known: what is "
-            "missing are other poses."
+            "The images agree with each other better than they determine the calibration: add "
+            "other poses."
         )
     return [
-        f"Seen through it, the target stays within {_mm(record['rms_mm'])} of one place{shown}: "
-        f"{', '.join(told)} of the mean square. {means}"
+        f"With this calibration, the images put the target {_mm(record['rms_mm'])} from its "
+        f"estimated place (RMS{shown}). Shares of the mean square: {', '.join(told)}. {means}"
     ]
 
 
@@ -199,9 +201,10 @@ def _poses(record: dict[str, Any]) -> str | None:
     gain = (more["tre_now_mm"] / more["tre_then_mm"]) ** 2 - 1
     alike, count = gain * record["images_used"], len(more["poses"])
     if alike < 2 * count:
-        return "The poses are well chosen: further images help only by their number."
+        return "The poses are well chosen: only a larger number of images would help."
     return (
-        f"Its poses: {count} well chosen images help as much as {alike:.0f} more of the same kind."
+        f"The poses: {count} well-chosen images would help as much as {alike:.0f} more of the same "
+        "kind."
     )
 
 
@@ -212,27 +215,25 @@ def believe(record: dict[str, Any]) -> list[str]:
         return []
     larger = (beside["rms_mm"] or 0.0) > beside["conventional_rms_mm"]
     first = (
-        f"Its residuals are larger than those of the conventional fit ({beside['rms_mm']:.3f} and "
-        f"{beside['conventional_rms_mm']:.3f} mm), as they must be: the conventional fit minimises "
-        "that sum and nothing else."
+        f"Its RMS residual is larger than that of the conventional fit ({beside['rms_mm']:.3f} "
+        f"against {beside['conventional_rms_mm']:.3f} mm), as it must be: the conventional fit "
+        "minimises exactly this."
         if larger
-        else f"Its residuals are those of the conventional fit ({beside['rms_mm']:.3f} and "
+        else f"Its RMS residual is that of the conventional fit ({beside['rms_mm']:.3f} against "
         f"{beside['conventional_rms_mm']:.3f} mm)."
     )
     lines = [first]
     if beside["conventional_tre_mm"] is not None and beside["tre_mm"] is not None:
         lines.append(
-            "With errors of the sizes found, equal weights would put the image "
-            f"{_mm(beside['conventional_tre_mm'])} off, these weights {_mm(beside['tre_mm'])}"
+            "With errors of the estimated sizes, a fit with equal weights has an expected error of "
+            f"{_mm(beside['conventional_tre_mm'])}, one with weights from these sizes "
+            f"{_mm(beside['tre_mm'])}"
         )
     gain, sd = beside["log_density_gain"], beside["log_density_gain_sd"]
     if gain is not None and sd is not None:
-        better = "more" if gain > 0 else "less"
-        lines[-1] += (
-            f"; images left out are predicted {better} closely (log density {gain:+.1f} +- "
-            f"{sd:.1f})"
-        )
-    lines[-1] += f". The two differ by {_mm(beside['apart_mm'])} at the image."
+        better = "better" if gain > 0 else "worse"
+        lines[-1] += f"; it predicts held-out images {better} (log density {gain:+.1f} +- {sd:.1f})"
+    lines[-1] += f". In the image, the two calibrations differ by {_mm(beside['apart_mm'])}."
     return [" ".join(lines)]
 
 
@@ -255,14 +256,14 @@ def certainty(record: dict[str, Any]) -> list[str]:
     along = max(range(3), key=lambda axis: record["covariance"][axis][axis])
     about = max(range(3), key=lambda axis: record["covariance"][3 + axis][3 + axis])
     lines = [
-        f"The image's position on the probe is known to {_mm(spread[0])}, worst along its "
-        f"{_AXES[along]} axis; its orientation to {spread[1]:.2f} degrees, worst about its "
-        f"{_AXES[about]} axis (one standard deviation)."
+        f"The image's position on the probe has a standard deviation of {_mm(spread[0])}, "
+        f"largest along its {_AXES[along]} axis; its orientation, one of {spread[1]:.2f} degrees, "
+        f"largest about its {_AXES[about]} axis."
     ]
     unseen = record["observability"]["known_only_from_prior"]
     if unseen and record["prior"] in TUNED:
         lines.append(
-            f"The images do not show {unseen}: it rests on the assumption that the target lay "
+            f"The images do not determine {unseen}: it rests on the assumption that the target lay "
             "evenly on both sides of the image plane."
         )
     if record.get("offset_law"):
@@ -299,26 +300,25 @@ def advice(record: dict[str, Any]) -> list[str]:
         advice.append(_addition(record))
     elif status == "max_iterations":
         advice.append(
-            "Leave out images whose target was mispicked (they have the largest residuals), or add "
-            "images; then calibrate again."
+            "Leave out images in which the target was picked wrongly (they have the largest "
+            "residuals), or add images; then calibrate again."
         )
     else:
         if few or record["verdict"] == "uncertain":
             advice.append(_addition(record))
     if status == "converged" and record["method"] == "conventional" and _out_of_plane(record):
         advice.append(
-            "Most of the error is out of the image plane, which the conventional method takes for "
-            "zero: try --method joint."
+            "Most of the error is out of the image plane, where the conventional method assumes "
+            "none: try --method joint."
         )
     if record["outliers"]:
         listed = ", ".join(map(str, record["outliers"][:10]))
         more = ", ..." if len(record["outliers"]) > 10 else ""
-        then = (
-            "they were left out."
-            if record.get("robust")
-            else "or calibrate again with --robust, which leaves them out."
-        )
+        images = f"images {listed}{more} (counted from 0)"
         advice.append(
-            f"Check images {listed}{more} (counted from 0) and pick the target again; {then}"
+            f"Check {images}, which were left out, and pick the target in them again."
+            if record.get("robust")
+            else f"Check {images} and pick the target in them again, or calibrate with --robust, "
+            "which leaves them out."
         )
     return advice

@@ -98,8 +98,8 @@ class Calibration:
         elevation: estimated elevational offset of the target in every image (q_iy), mm; 0 where an
             image was left out.
         sigma: SDs of lateral position, range and elevational offset, mm.
-        offset_law: what the data say about the offsets' law, their mean and the noise; None where
-            no laws were weighed.
+        offset_law: what the data say about the distribution of the offsets, their mean and the
+            noise; None if no distributions were compared.
         channel_sigma: SD of an element's distance, mm; None for solves on points.
         unknowns_covariance: covariance of all unknowns, in the order of ``blocks`` (mm, rad, log
             units); NaN where X is not observable.
@@ -116,8 +116,8 @@ class Calibration:
         linearisation: the normal matrices, from which the properties are computed.
         problem: the data that were solved, including images left out.
         method: ``conventional``, ``alternating`` or ``joint`` (static).
-        prior: ``none``, ``bounded``, ``gaussian``, or, where laws of the offsets were weighed,
-            ``auto`` or ``uniform`` (static).
+        prior: ``none``, ``bounded``, ``gaussian``, or, if distributions of the offsets were
+            compared, ``auto`` or ``uniform`` (static).
         data: ``points`` or ``channels``, whichever residuals were minimised (static).
         blocks: the free unknowns (static).
         robust: images that do not fit the rest were left out (static).
@@ -202,7 +202,7 @@ class Calibration:
 
     @property
     def searched_start(self) -> Bool[AnyArray, "*batch"]:
-        """Whether the closed-form start was unsound, so that a search found another start."""
+        """Whether the closed-form start was unusable, and a search found another one."""
         return self.convergence.searched_start
 
     @property
@@ -300,7 +300,7 @@ class Calibration:
 
     @property
     def weakest(self) -> Float[np.ndarray, "*batch p"]:
-        """Unit vector (scaled units) of the least known direction of all unknowns."""
+        """Unit vector (scaled units) of the least well determined direction of all unknowns."""
         return self._summary.weakest
 
     @property

@@ -316,7 +316,7 @@ class ImageTransform:
         return saved.text_of(self, format, frames=frames)
 
     def left_out(self, format: SaveFormat) -> str | None:
-        """What a format cannot hold and its user must do, in words; None where nothing is."""
+        """What a format cannot hold and its user must do, in words; None if it holds everything."""
         from jaxcal.result import saved
 
         return saved.left_out(self, format)

@@ -62,8 +62,8 @@ class Protocol:
     Attributes:
         images: calibration images.
         test_images: noise-free in-plane test images.
-        elevation_mm: bound or SD of the elevational offsets, as their law has it.
-        elevation_distribution: their law, see :mod:`jaxcal.study.offsets`.
+        elevation_mm: bound or SD of the elevational offsets, depending on their distribution.
+        elevation_distribution: their distribution, see :mod:`jaxcal.study.offsets`.
         noise_mm: SD of the noise on each element's distance.
         lateral_mm: the target's lateral position is uniform within +- this (linear probes).
         depth_mm: its depth is uniform between these; curvilinear probes: its range from the arc.

@@ -245,11 +245,11 @@ def test_signals_end_a_background_job_in_order(tmp_path, number, times, moment, 
         assert len(file["calibration/target"]) >= least
 
 
-KEYS = {"Step down": "j", "Step up": "k", "m lets the robot": "m", "Enter accepts": "\r"}
+KEYS = {"Step down": "j", "Step up": "k", "m moves the robot": "m", "Enter accepts": "\r"}
 # The last row of the view: what stands before it is complete.
 ASKED = re.compile(
     r"(?P<title>pose \d of 4)(?P<view>(?:(?!pose \d of 4).)*?)"
-    r"(?P<advice>Step down|Step up|m lets the robot|Enter accepts)(?:(?!pose \d of 4).)*?: stop",
+    r"(?P<advice>Step down|Step up|m moves the robot|Enter accepts)(?:(?!pose \d of 4).)*?: stop",
     re.DOTALL,
 )
 
@@ -611,9 +611,11 @@ def test_a_failing_disk_is_one_line_and_status_4(tmp_path, what):
     assert process.wait() == 4, lines
     process.stderr.close()
     assert not any("Traceback" in line or "Exception" in line for line in lines)
-    reason = "the disk takes no more: File too large" if what == "limit" else "was removed"
+    reason = (
+        "the disk cannot be written any more: File too large" if what == "limit" else "was removed"
+    )
     found = re.search(
-        r"(\d+) of 12 images are in (\S+); put it right, then: .* --resume", lines[-1]
+        r"(\d+) of 12 images are in (\S+); correct this, then: .* --resume", lines[-1]
     )
     assert reason in lines[-1]
     assert found is not None

@@ -423,7 +423,7 @@ def test_a_device_that_does_something_else() -> None:
                      .get(text, text))  # fmt: skip
 
     with scripted(answer) as path, ActiveEcho(path, clock=Clock(speed=10.0)) as device:
-        with pytest.raises(DeviceError, match="was told THR 200 and says 100"):
+        with pytest.raises(DeviceError, match="was set to THR 200, but reports 100"):
             device.set_threshold(200)
         with pytest.raises(DeviceError, match=r"answered THR. by 'many'"):
             device.threshold()

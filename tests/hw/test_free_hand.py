@@ -320,7 +320,7 @@ def test_a_machine_that_is_frozen_has_no_image_taken(tmp_path, plus_server):
 def test_options_that_the_recording_knows(capsys, option):
     assert main(["free-hand", "localhost", "r.h5", "--resume", *option]) == 2
     error = capsys.readouterr().err
-    assert f"{option[0]} does not go with --resume: the recording knows" in error
+    assert f"{option[0]} cannot be used with --resume: the recording holds this setting" in error
     assert error.count("\n") == 1
 
 

@@ -164,7 +164,7 @@ class Person:
             self._there = now
         if now < self._rests_until:
             return
-        if "s begins the sweep anew" in advice or now - self._there > 4.0:
+        if "s restarts the sweep" in advice or now - self._there > 4.0:
             # Where a sweep came to nothing a person begins another one.
             self._there = now
             self._keys.append("s")
@@ -250,7 +250,7 @@ def test_enter_is_refused_until_both_sides_were_seen(tmp_path, bench):
             self.words += f"{words}\n"
             if "mm |" in words:
                 self._keys.append("enter")
-            if "look at both sides first" in self.words:
+            if "visit both sides first" in self.words:
                 self._keys.append("q")
 
     person = Hasty(bench.hand)
@@ -298,7 +298,7 @@ def test_frames_of_the_element_that_are_late_are_not_used_and_told_of(tmp_path):
             if re.search(told, words) or len(shown) == 60:
                 self._keys.append("q")
 
-    told = r"the element's frames are 0\.[89] s late: look at the link to it"
+    told = r"the element's frames are 0\.[89] s late: check the link to it"
     shown: list[str] = []
     bench = Bench("tcp")
     with bench.echo, bench.images:

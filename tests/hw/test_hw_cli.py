@@ -29,7 +29,10 @@ from hw.robot.motion_plan import MotionPlan
         (["acquire"], "either --bench or --setup"),
         (["acquire", "--bench", "--setup", "x.toml"], "either --bench or --setup"),
         (["acquire", "--bench", "--resume"], "needs the RECORDING"),
-        (["acquire", "a.h5", "--bench", "--resume", "--images", "5"], "--images does not go"),
+        (
+            ["acquire", "a.h5", "--bench", "--resume", "--images", "5"],
+            "--images cannot be used with --resume",
+        ),
         (["acquire", "a.h5", "--bench", "--resume"], "no such file"),
         (["acquire", "--bench", "--images", "3"], "'--images'"),
         (["acquire", "--bench", "--placement", "guess"], "'--placement'"),
@@ -94,7 +97,7 @@ def test_a_dry_run_shows_the_plan_and_makes_nothing(tmp_path, monkeypatch, capsy
         "arm: UR5",
         "caps: step 250 mm, turn 120 deg, tilt 60 deg, speed 50 mm/s (10 mm/s within 25 mm and 0.5 "
         "deg of a pose), force 20 N",
-        "a UR5 reaches every pose on every way: branch ",
+        "a UR5 can reach every pose along every path: branch ",
     ):
         assert line in out
     path.write_text(armed.replace("search_deg = 0.5", "min_singular_value_mm = 95"))

@@ -90,7 +90,7 @@ def test_the_advice_leads_to_the_mid_plane():
 
 ADVICE = {
     "Step down": "j", "Step up": "k",
-    "m lets the robot": "m", "Enter accepts": "enter",
+    "m moves the robot": "m", "Enter accepts": "enter",
 }  # fmt: skip
 
 

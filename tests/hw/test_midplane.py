@@ -167,7 +167,7 @@ def test_far_off_start_needs_the_wide_raster_and_too_far_is_told():
         stage = WorldStage(world, moved, rng)
         assert amplitude_scan(stage).bracket.contains(stage.elevation_mm)
     moved[:3, 3] += 60.0
-    with pytest.raises(PlacementError, match="not heard within"):
+    with pytest.raises(PlacementError, match="no response of the element within"):
         amplitude_scan(WorldStage(world, moved, rng))
 
 

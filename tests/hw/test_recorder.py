@@ -277,7 +277,7 @@ def test_a_disk_that_does_not_answer_or_is_full_is_one_line(tmp_path):
             recorder.add_images([SimpleNamespace(**{**vars(frames(k, 1)[0]), "array": large})])
             recorder.sync()
 
-    with pytest.raises(jaxcal.OutputError, match="the disk takes no more"):
+    with pytest.raises(jaxcal.OutputError, match="the disk cannot be written any more"):
         fill()
     with pytest.raises(jaxcal.OutputError):
         recorder.close()

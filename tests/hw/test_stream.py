@@ -322,9 +322,9 @@ TYPES = b"\x01" + b",".join(
 @pytest.mark.parametrize(
     ("messages", "text"),
     [
-        ([b"\x00\x00V"], "no RTDE data"),
+        ([b"\x00\x00V"], "not RTDE data"),
         ([rtde(b"V", b"\x00")], "version 2"),
-        ([rtde(b"V", b"\x01"), rtde(b"v", b"123")], "did not tell its version"),
+        ([rtde(b"V", b"\x01"), rtde(b"v", b"123")], "did not report its version"),
         ([rtde(b"V", b"\x01"), VERSION, rtde(b"O", b"\x01NOT_FOUND,DOUBLE")], "has no"),
         ([rtde(b"V", b"\x01"), VERSION, rtde(b"O", b"")], "has no"),
         ([rtde(b"V", b"\x01"), VERSION, rtde(b"O", TYPES), rtde(b"S", b"\x00")], "start sending"),

@@ -87,7 +87,7 @@ class OutOfPlane:
 
 @dataclass(frozen=True)
 class Segmentation:
-    """Segmented points, and what became of every frame.
+    """Segmented points, and the outcome for every frame.
 
     Attributes:
         images: of kind ``point``, with a covariance for each frame (none with ``shortest``, which

@@ -144,7 +144,8 @@ class Picks:
         # Points that a second page or an editor has put there must not be lost.
         if self._content() not in (self._known, None):
             raise OutputError(
-                f"{self.path}: was changed by another program: Ctrl-C, and the same command goes on"
+                f"{self.path}: was changed by another program: press Ctrl-C and run the same "
+                "command again"
             )
         write_text(self.path, "\n".join([*head, *rows, ""]))
         self._known = self._content()

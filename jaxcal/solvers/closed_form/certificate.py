@@ -52,7 +52,7 @@ SINGULAR = 1e-11
 
 @dataclass(frozen=True)
 class Certificate:
-    """What is proved of an answer to Eq. 7.
+    """What is proved about a solution of Eq. 7.
 
     Attributes:
         certified: no transform, target and free scales fit Eq. 7 better, up to one part in 1e9 and
@@ -202,7 +202,7 @@ def certify(
     sound_speed_factor: float = 1.0,
     estimate: tuple[str, ...] = (),
 ) -> Certificate:
-    """Prove that an answer is the global minimum of Eq. 7, or say how far it may be from it.
+    """Prove that a solution is the global minimum of Eq. 7, or bound how far it is above it.
 
     Args:
         problem: one problem, a recording, or one set of images.

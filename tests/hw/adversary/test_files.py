@@ -356,7 +356,7 @@ def test_a_limit_of_a_files_size_ends_in_a_file_that_opens(tmp_path):
     with Writing(tmp_path / "rec.h5", limit) as writing:
         while writing.take():
             pass
-        what = "the disk takes no more: File too large: make room"
+        what = "the disk cannot be written any more: File too large: free some space"
         assert writing.error() == f"error {writing.path}: {what}"
     assert writing.kept == writing.path
     assert writing.images >= 2

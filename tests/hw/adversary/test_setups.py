@@ -54,7 +54,7 @@ def dry_run(folder: Path, text: str, capsys: pytest.CaptureFixture) -> tuple[int
 def test_the_good_setup_passes(tmp_path, capsys):
     status, out, _ = dry_run(tmp_path, GOOD, capsys)
     assert status == 0
-    assert "a UR5 reaches every pose on every way" in out
+    assert "a UR5 can reach every pose along every path" in out
 
 
 @pytest.mark.parametrize(
