@@ -33,11 +33,11 @@ from scipy import special
 
 from jaxcal import InputError
 from jaxcal.data.sound import WATER_M_S
-from jaxcal.diagnostics.uncertainty import TUNED
 from jaxcal.model.image_points import mean_of_squares, point_jacobian
 from jaxcal.model.unknowns import in_image, size
 from jaxcal.runtime.array_types import AnyArray, Float
 from jaxcal.runtime.arrays import array_module, is_number, is_traced, real_array, traceable
+from jaxcal.solvers.plan import TUNED
 
 if TYPE_CHECKING:
     from jaxcal.result.calibration import Calibration

@@ -34,6 +34,9 @@ Prior = Literal["none", "gaussian", "bounded"]
 LAWS: dict[str, tuple[Shape, ...]] = {"auto": SHAPES, "uniform": UNIFORM}
 """The priors of the joint method that weigh laws of the offsets, each with its laws."""
 
+TUNED = ("gaussian", *LAWS)
+"""Priors with SDs of lateral position, range and offset."""
+
 DEFAULT_MAX_ELEVATION_MM = 1.0
 """The bound on the offsets if none is given; it is that of the paper."""
 
