@@ -23,7 +23,7 @@ from jaxcal.diagnostics.uncertainty import LARGEST_SD, inverses, mm_at_target, t
 from jaxcal.model.unknowns import EXTRA, block_slice, size
 from jaxcal.result.calibration import Calibration, Linearisation, Medium, Status
 from jaxcal.runtime.array_types import Float
-from jaxcal.runtime.trees import map_arrays
+from jaxcal.runtime.arrays import map_arrays
 from jaxcal.solvers.closed_form.reduced_objective import CONSTRAINTS
 from jaxcal.solvers.closed_form.single import ClosedForm, solve_problem
 from jaxcal.solvers.convergence import Convergence

@@ -31,8 +31,7 @@ from jaxcal.diagnostics.metrics import calibration_reproducibility
 from jaxcal.model.parameters import Parameters
 from jaxcal.model.residuals import measured_points, measurement_residual
 from jaxcal.result.calibration import Calibration
-from jaxcal.runtime import buckets
-from jaxcal.runtime.arrays import is_traced
+from jaxcal.runtime.arrays import each_image, is_traced
 from jaxcal.runtime.given_values import LARGEST_SEED, check_key, check_made, whole_number
 from jaxcal.runtime.messages import shown
 from jaxcal.runtime.precision import in_own_modes
@@ -356,7 +355,7 @@ def _drawn(problem: Problem, rows: Array, mask: Float[Array, " n"]) -> Problem:
     """The problem with other rows of images in each of k copies."""
 
     def drawn(rows: Int[Array, " n"]) -> Problem:
-        found = buckets.each_image(problem, lambda values, axis: jnp.take(values, rows, axis))
+        found = each_image(problem, lambda values, axis: jnp.take(values, rows, axis))
         return replace(found, mask=mask)
 
     return jax.vmap(drawn)(rows)

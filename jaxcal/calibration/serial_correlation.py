@@ -28,8 +28,7 @@ import numpy as np
 
 from jaxcal.diagnostics.image_errors import ImageErrors, Whitened
 from jaxcal.runtime.array_types import Float
-from jaxcal.runtime.arrays import like
-from jaxcal.runtime.trees import map_arrays
+from jaxcal.runtime.arrays import like, map_arrays
 from jaxcal.solvers.plan import TUNED
 
 if TYPE_CHECKING:

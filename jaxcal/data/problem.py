@@ -8,7 +8,7 @@ same class with leading axes on every array.
 from __future__ import annotations
 
 import sys
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,12 +16,10 @@ import numpy as np
 from jaxcal import InputError
 from jaxcal.data.probe import CurvilinearProbe
 from jaxcal.data.recording import Images, Kind, Recording, images_of, make_images
-from jaxcal.runtime import buckets
 from jaxcal.runtime.array_types import AnyArray, Float, HeldArray
-from jaxcal.runtime.arrays import array_module, is_traced
+from jaxcal.runtime.arrays import array_module, array_tree, each_image, is_traced, static
 from jaxcal.runtime.messages import shown
 from jaxcal.runtime.precision import importing_jax, in_own_modes
-from jaxcal.runtime.trees import array_tree, assembled, static
 
 if TYPE_CHECKING:
     from jax.typing import DTypeLike
@@ -247,22 +245,9 @@ def _floating(dtype: DTypeLike | None) -> np.dtype:
     return found
 
 
-def fill_up(problem: Problem) -> Problem:
-    """A problem or batch with masked images up to its bucket's size; numpy arrays if it grows."""
-    more = buckets.size(problem.images) - problem.images
-    if not more:
-        return problem
-    rows = [*range(problem.images), *[problem.images - 1] * more]  # a masked pose must be rigid
-    mask = np.asarray(problem.mask)
-    mask = np.concatenate([mask, np.zeros((*mask.shape[:-1], more), mask.dtype)], axis=-1)
-    longer = taken(problem, rows)
-    parts = {field.name: getattr(longer, field.name) for field in fields(longer)}
-    return assembled(Problem, parts | {"mask": mask})
-
-
 def taken(problem: Problem, rows: list[int]) -> Problem:
     """Some images of one problem, in numpy arrays; an image may be taken several times."""
-    return buckets.each_image(problem, lambda values, axis: np.take(np.asarray(values), rows, axis))
+    return each_image(problem, lambda values, axis: np.take(np.asarray(values), rows, axis))
 
 
 @importing_jax

@@ -39,7 +39,7 @@ from jaxcal.diagnostics.image_errors import (
 from jaxcal.diagnostics.uncertainty import inverses
 from jaxcal.model.unknowns import heard
 from jaxcal.runtime.array_types import Bool, Float, Int
-from jaxcal.runtime.trees import map_arrays
+from jaxcal.runtime.arrays import map_arrays
 from jaxcal.solvers.plan import TUNED
 
 if TYPE_CHECKING:

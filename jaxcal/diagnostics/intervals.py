@@ -36,7 +36,9 @@ from jaxcal.data.sound import WATER_M_S
 from jaxcal.model.image_points import mean_of_squares, point_jacobian
 from jaxcal.model.unknowns import in_image, size
 from jaxcal.runtime.array_types import AnyArray, Float
-from jaxcal.runtime.arrays import array_module, is_number, is_traced, real_array, traceable
+from jaxcal.runtime.arrays import array_module, is_traced
+from jaxcal.runtime.given_values import is_number, real_array
+from jaxcal.runtime.precision import traceable
 from jaxcal.solvers.plan import TUNED
 
 if TYPE_CHECKING:

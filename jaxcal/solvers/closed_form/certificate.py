@@ -26,7 +26,7 @@ import numpy as np
 
 from jaxcal import InputError
 from jaxcal.runtime.array_types import Float
-from jaxcal.runtime.arrays import real_array
+from jaxcal.runtime.given_values import real_array
 from jaxcal.solvers.closed_form.reduced_objective import ReducedObjective, image_data, reduce
 from jaxcal.solvers.closed_form.rotation_relaxation import lower_bound
 

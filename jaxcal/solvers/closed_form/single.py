@@ -36,7 +36,7 @@ import numpy as np
 
 from jaxcal.data.poses import rotations_from_quaternions
 from jaxcal.runtime.array_types import Float
-from jaxcal.runtime.trees import array_tree
+from jaxcal.runtime.arrays import array_tree
 from jaxcal.solvers.closed_form.certificate import Certificate, certify_point, tolerance
 from jaxcal.solvers.closed_form.reduced_objective import (
     ImageData,

@@ -9,7 +9,7 @@ import numpy as np
 from jaxcal.data.problem import Problem
 from jaxcal.model.unknowns import Blocks
 from jaxcal.runtime.array_types import Bool, Float, HeldArray
-from jaxcal.runtime.trees import array_tree, assembled
+from jaxcal.runtime.arrays import array_tree, assembled
 from jaxcal.solvers.closed_form.single import solve_problem
 
 
