@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 import jaxcal
 from jaxcal.calibration import programs
+from jaxcal.calibration.calibrate import Request, prepare
 from jaxcal.calibration.engine import fill_up
-from jaxcal.calibration.options import Request, prepare
 from jaxcal.data.problem import taken
 from jaxcal.runtime import executables
 from jaxcal.runtime.arrays import each_image, first_images

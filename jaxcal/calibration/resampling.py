@@ -24,8 +24,7 @@ from jaxtyping import Array, Float, Int, Key
 from jaxcal import InputError
 from jaxcal.calibration.calibrate import calibrate, calibrate_batch
 from jaxcal.calibration.dependence import independent
-from jaxcal.calibration.options import as_problem
-from jaxcal.data.problem import Problem
+from jaxcal.data.problem import Problem, as_problem
 from jaxcal.data.recording import MINIMUM_IMAGES, Recording
 from jaxcal.diagnostics.metrics import calibration_reproducibility
 from jaxcal.model.parameters import Parameters

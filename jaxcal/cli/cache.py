@@ -105,8 +105,7 @@ def warm(
         program_cache.private_folder()
     except (OSError, RuntimeError) as error:
         raise OutputError(f"the cache cannot be used: {error}") from error
-    from jaxcal.calibration.calibrate import calibrate
-    from jaxcal.calibration.options import unknown_names
+    from jaxcal.calibration.calibrate import calibrate, unknown_names
     from jaxcal.runtime.executables import bucket
 
     names = unknown_names(estimate)
