@@ -29,13 +29,13 @@ from jaxcal.data.recording import MINIMUM_IMAGES, Recording
 from jaxcal.diagnostics.metrics import calibration_reproducibility
 from jaxcal.model.parameters import Parameters
 from jaxcal.model.residuals import measured_points, measurement_residual
+from jaxcal.model.thresholds import MAD
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.arrays import each_image, is_traced
 from jaxcal.runtime.given_values import LARGEST_SEED, check_key, check_made, whole_number
 from jaxcal.runtime.messages import shown
 from jaxcal.runtime.precision import in_own_modes
 from jaxcal.solvers import dense
-from jaxcal.solvers.methods import nominal_sound_speed
 
 LARGEST_RESAMPLES = 100_000
 
@@ -247,7 +247,7 @@ def _scatter(problem: Problem, result: Calibration, fits: Calibration) -> Bootst
     return Bootstrap(
         image_to_probe=drawn,
         converged=converged,
-        spread=1.4826 * jnp.nanmedian(moved, axis=0),
+        spread=MAD * jnp.nanmedian(moved, axis=0),
         reproducibility=jnp.asarray(calibration_reproducibility(transforms, points)) / share,
         image_points=points,
     )
@@ -366,7 +366,7 @@ def _parameters(result: Calibration, problem: Problem) -> Parameters:
     if result.scale_mm_per_px is not None:
         scale = jnp.asarray(result.scale_mm_per_px / problem.spacing)
     found = Parameters.of(matrix[:3, :3], matrix[:3, 3], jnp.asarray(result.point), scale)
-    nominal = nominal_sound_speed(problem)
+    nominal = problem.nominal_sound_speed
     if result.sound_speed_m_s is not None:
         found = replace(found, sound_speed=result.sound_speed_m_s / nominal)
     if result.delay_s is not None:

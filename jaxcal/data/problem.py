@@ -19,6 +19,7 @@ import numpy as np
 from jaxcal import InputError
 from jaxcal.data.probe import CurvilinearProbe
 from jaxcal.data.recording import MINIMUM_IMAGES, Images, Kind, Recording, images_of, make_images
+from jaxcal.data.sound import WATER_M_S
 from jaxcal.runtime.array_types import AnyArray, Float, HeldArray
 from jaxcal.runtime.arrays import array_module, array_tree, each_image, is_traced, static
 from jaxcal.runtime.messages import shown
@@ -106,6 +107,14 @@ class Problem:
     def batch_shape(self) -> tuple[int, ...]:
         """Leading axes; () for one problem."""
         return self.mask.shape[:-1]
+
+    @property
+    def nominal_sound_speed(self) -> Float[HeldArray, "*batch"]:
+        """The speed by which times of flight became distances, m/s; water's where unknown."""
+        if self.sound_speed is None:
+            xp = array_module(self.mask)
+            return xp.full(self.batch_shape, WATER_M_S, self.mask.dtype)
+        return self.sound_speed
 
     def cleared(self, used: Float[AnyArray, "*batch n"]) -> Problem:
         """The problem with harmless values in images that are not used: NaN times 0 is NaN, not 0.

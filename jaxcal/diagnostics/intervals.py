@@ -169,7 +169,7 @@ def range_of_row_zero(
     face, before, nominal = 0.0, 0.0, WATER_M_S
     if problem is not None:
         face = problem.face_offset
-        nominal = WATER_M_S if problem.sound_speed is None else problem.sound_speed
+        nominal = problem.nominal_sound_speed
         before = 0.0 if problem.delay is None else problem.delay
     one = xp.ones(np.shape(calibration.mask)[:-1])
     speed, delay = one, 0.0
