@@ -9,9 +9,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from jaxcal.diagnostics.uncertainty import TUNED
 from jaxcal.report.paragraphs import listed
 from jaxcal.report.resampled import resampled_sentences
+from jaxcal.solvers.plan import TUNED
 
 FEW_IMAGES = 20
 _MOST_MOVED_SHARE = 0.3

@@ -31,11 +31,10 @@ from jaxcal.data.segmentation.time_of_flight import (
     fit_out_of_plane,
     shortest,
 )
-from jaxcal.runtime import buckets, executables
+from jaxcal.runtime import executables
 from jaxcal.runtime.array_types import AnyArray
-from jaxcal.runtime.arrays import is_number
 from jaxcal.runtime.compiler import ONE_PROBLEM, batch_wishes, fast_to_run
-from jaxcal.runtime.given_values import check_flag, whole_number
+from jaxcal.runtime.given_values import check_flag, is_number, whole_number
 from jaxcal.runtime.messages import shown
 from jaxcal.runtime.precision import in_own_modes
 
@@ -409,7 +408,7 @@ def _fitted(
     if jax.default_backend() != "cpu":
         return compiled_fit(*how)(distances, positions)
     count, elements = distances.shape
-    padded = np.full((buckets.size(count), elements), np.nan)
+    padded = np.full((executables.bucket(count), elements), np.nan)
     padded[:count] = distances
     found = executables.run(
         "jaxcal.data.segmentation.segment:fit_frames",
