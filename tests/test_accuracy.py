@@ -250,6 +250,19 @@ def test_predicting_an_image_from_the_others_is_what_bayes_says():
     np.testing.assert_allclose(found.expected.trace(axis1=1, axis2=2) > 0, True)
 
 
+def test_the_part_of_the_image_is_named_where_the_rest_is_hardly_known():
+    images = experiment(3, images=100).calibration
+    depth = images.measurements[:, 1]
+    strip = np.abs(depth - np.median(depth)) < 3
+    for mask, told in ((strip, True), (strip | True, False)):
+        data = jaxcal.Problem.from_arrays(images.poses, images.measurements, mask=mask)
+        said = "\n".join(jaxcal.calibrate(data, "conventional").verdict())
+        assert ("elsewhere the error may be larger" in said) == told
+        if told:
+            least, most = said.split(" mm; elsewhere")[0].split("depth ")[-1].split(" to ")
+            assert depth[strip].min() - 5 < int(least) < int(most) < depth[strip].max() + 5
+
+
 def test_residuals_that_keep_to_the_model_do_not_contradict_it():
     rng = np.random.default_rng(4)
     rows = rng.normal(size=(40, 3, 5))
