@@ -213,6 +213,9 @@ def bootstrap(
     rows = _rows(root, mask, resamples)
     # Each draw has as many images as were used, since the mask leaves out the other rows.
     options: dict[str, Any] = {**arguments, "robust": False}
+    bound: Any = options.get("max_elevation")
+    if np.shape(bound) == (problem.images,):
+        options["max_elevation"] = jnp.asarray(bound)[rows]  # drawn with its image
     fits = calibrate_batch(_drawn(problem, rows, mask), **options)
     _check_alike(result, fits)
     return _scatter(problem, result, fits)

@@ -255,7 +255,10 @@ class Whitened:
 
 
 def own_covariance(answer: Calibration, seen: ImageErrors) -> Float[Array, "k n 2 2"] | None:
-    """The shape of the images' own covariances, if these whiten the errors; else None."""
+    """The images' own covariances in units of the common SDs, if these whiten errors; else None.
+
+    A tracker's variance is part of both.
+    """
     given = seen.problem.covariance
     if given is None:
         return None
@@ -268,7 +271,15 @@ def own_covariance(answer: Calibration, seen: ImageErrors) -> Float[Array, "k n 
         shaped = shaped & (np.asarray(answer.offset_law.own_probability) > 0.5)
     scale = 1 / np.sqrt(np.where(mean > 0, mean, 1.0))
     shape = covariance * (scale[:, :, None] * scale[:, None])[:, None]
-    return np.where(shaped[:, None, None, None], shape, np.eye(2))
+    shape = np.where(shaped[:, None, None, None], shape, np.eye(2))
+    tau = answer.linearisation.tracker_sd
+    if tau is None:
+        return shape
+    # The tracker adds the same variance to the errors of all images.
+    sigma = np.asarray(answer.sigma)[:, :2]
+    own = sigma / np.hypot(sigma, tau[:, None])
+    shape = shape * (own[:, :, None] * own[:, None])[:, None]
+    return shape + (1 - own**2)[:, None, :, None] * np.eye(2)
 
 
 def _decorrelated(
