@@ -38,7 +38,7 @@ class MissingExtraError(CalibrationError, ImportError):
 _ERRORS = ("CalibrationError", "FormatError", "InputError", "MissingExtraError", "OutputError")
 _HOME = {
     "Calibration": "jaxcal.result.calibration",
-    "Certificate": "jaxcal.solvers.closed_form.certificate",
+    "Certificate": "jaxcal.solvers.closed_form.reduced_objective",
     "ClosedForm": "jaxcal.solvers.closed_form.single",
     "CurvilinearProbe": "jaxcal.data.probe",
     "ImageTransform": "jaxcal.result.transform",
@@ -106,8 +106,8 @@ if TYPE_CHECKING:
     from jaxcal.result.saved import load_calibration as load_calibration
     from jaxcal.result.transform import ImageTransform as ImageTransform
     from jaxcal.solvers.closed_form.calibrate import calibrate_closed_form as calibrate_closed_form
-    from jaxcal.solvers.closed_form.certificate import Certificate as Certificate
     from jaxcal.solvers.closed_form.certificate import certify as certify
+    from jaxcal.solvers.closed_form.reduced_objective import Certificate as Certificate
     from jaxcal.solvers.closed_form.single import ClosedForm as ClosedForm
     from jaxcal.solvers.plan import Options as Options
     from jaxcal.study.simulation import Protocol as Protocol

@@ -192,14 +192,28 @@ def test_an_image_that_alone_determines_a_direction_does_not_multiply_the_error(
     assert "<svg" in result._repr_html_()
 
 
+def sum_of_squares(result, sigma, tracker_sd):
+    """Of an answer's errors in SDs; the tracker's variance is the same in all images."""
+    data, tau = jax.tree.map(np.asarray, result.problem), tracker_sd or 0.0
+    to_image = np.linalg.inv(data.poses @ np.asarray(result.image_to_probe))
+    q = (to_image @ np.append(result.point, 1.0))[:, :3]
+    y = np.asarray(result.elevation)
+    seen = np.stack([q[:, 0], np.hypot(y, q[:, 2])], axis=1) - data.measurements
+    size = sigma[:2] / np.sqrt(np.diagonal(data.covariance.mean(axis=0)))
+    whole = data.covariance * np.outer(size, size) + tau**2 * np.eye(2)
+    tracked = 0.0 if tracker_sd is None else np.sum((y - q[:, 1]) ** 2) / tau**2
+    within = np.einsum("ni,nij,nj", seen, np.linalg.inv(whole), seen)
+    return within + np.sum(y**2) / sigma[2] ** 2 + tracked
+
+
 @pytest.mark.parametrize("tracker_sd", [None, 0.2])
 def test_whitened_errors_are_those_of_the_solve(tracker_sd):
     """Their normal matrix is the solve's information, and their gradient vanishes there."""
     given = {"sigma": (0.2, 0.1, 0.6), "tracker_sd": tracker_sd}
-    # Without a tracker that errs, with a covariance for each image.
+    # With a covariance for each image.
     recording = jaxcal.simulate_recording(jaxcal.Protocol(images=24), 3)
-    recording = experiment(3, images=24) if tracker_sd is not None else recording
     result = jaxcal.calibrate(recording, "joint", "gaussian", **given)
+    assert float(result.cost) == pytest.approx(sum_of_squares(result, **given), rel=1e-9)
     alone = jax.tree.map(influences._first, result.numpy())
     whitened = influences._whitened(alone)
     information = np.einsum("mkp,mkq->pq", whitened.rows, whitened.rows)
@@ -234,6 +248,19 @@ def test_predicting_an_image_from_the_others_is_what_bayes_says():
         expected = evidence(rows, errors) - evidence(rows[others], errors[others])
         assert found.log_density[image] == pytest.approx(expected, rel=1e-9)
     np.testing.assert_allclose(found.expected.trace(axis1=1, axis2=2) > 0, True)
+
+
+def test_the_part_of_the_image_is_named_where_the_rest_is_hardly_known():
+    images = experiment(3, images=100).calibration
+    depth = images.measurements[:, 1]
+    strip = np.abs(depth - np.median(depth)) < 3
+    for mask, told in ((strip, True), (strip | True, False)):
+        data = jaxcal.Problem.from_arrays(images.poses, images.measurements, mask=mask)
+        said = "\n".join(jaxcal.calibrate(data, "conventional").verdict())
+        assert ("elsewhere the error may be larger" in said) == told
+        if told:
+            least, most = said.split(" mm; elsewhere")[0].split("depth ")[-1].split(" to ")
+            assert depth[strip].min() - 5 < int(least) < int(most) < depth[strip].max() + 5
 
 
 def test_residuals_that_keep_to_the_model_do_not_contradict_it():

@@ -15,9 +15,12 @@ from hypothesis import strategies as st
 
 import jaxcal
 from jaxcal.calibration import programs
-from jaxcal.calibration.options import Request, prepare
-from jaxcal.data.problem import fill_up, taken
-from jaxcal.runtime import buckets, executables
+from jaxcal.calibration.calibrate import Request, prepare
+from jaxcal.calibration.engine import fill_up
+from jaxcal.data.problem import taken
+from jaxcal.runtime import executables
+from jaxcal.runtime.arrays import each_image, first_images
+from jaxcal.runtime.executables import bucket
 
 METHODS: dict[str, dict] = {
     "alternating": {"method": "alternating", "max_elevation": 2.0},
@@ -34,15 +37,15 @@ def problems() -> list[jaxcal.Problem]:
 
 def test_buckets_grow_by_a_half_or_a_third():
     expected = (8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256, 384, 512)
-    assert tuple(sorted({buckets.size(n) for n in range(1, 513)})) == expected
-    assert all(n <= buckets.size(n) for n in range(1, 2000))
-    assert all(buckets.size(n) <= 1.5 * n for n in range(8, 2000))
+    assert tuple(sorted({bucket(n) for n in range(1, 513)})) == expected
+    assert all(n <= bucket(n) for n in range(1, 2000))
+    assert all(bucket(n) <= 1.5 * n for n in range(8, 2000))
 
 
 def test_every_axis_of_images_is_known(problems):
     """What holds a number for each image is padded and cut; nothing else is."""
     result = jaxcal.calibrate(problems[0], "conventional").numpy()
-    cut = buckets.cut(result, 9)
+    cut = first_images(result, 9)
     before, after = dict(shapes(result)), dict(shapes(cut))
     changed = {name for name in before if before[name] != after[name]}
     assert {"elevation", "mask", "problem.poses", "problem.measurements"} <= changed
@@ -89,7 +92,7 @@ def with_garbage(problem: jaxcal.Problem, more: int) -> jaxcal.Problem:
 
 def same(one: jaxcal.Calibration, other: jaxcal.Calibration, images: int) -> None:
     """Equal to 1e-10 SD, every decision included."""
-    one, other = one.numpy(), buckets.cut(other.numpy(), images)
+    one, other = one.numpy(), first_images(other.numpy(), images)
     assert one.status == other.status
     for name in ("mask", "at_bound", "searched_start", "tolerance_met"):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
@@ -134,7 +137,7 @@ def test_masked_images_beyond_the_bucket_change_nothing(name, problems):
         mask = jnp.asarray([float(k not in left_out) for k in range(count)])
         problem = replace(problem, mask=mask)
         padded = with_garbage(problem, 12 - count + more)
-        assert buckets.size(padded.images) == 16
+        assert bucket(padded.images) == 16
         same(jaxcal.calibrate(problem, **METHODS[name]), jaxcal.calibrate(padded, **METHODS[name]),
              count)  # fmt: skip
 
@@ -148,7 +151,7 @@ def test_images_left_out_between_others_change_nothing(problems):
     spread = jax.tree.map(jnp.asarray, taken(problem, rows))
     spread = replace(spread, mask=jnp.zeros(16).at[np.array(first)].set(1.0))
     found = jaxcal.calibrate(spread).numpy()
-    found = buckets.each_image(found, lambda values, axis: np.take(values, first, axis))
+    found = each_image(found, lambda values, axis: np.take(values, first, axis))
     same(jaxcal.calibrate(problem), found, 12)
 
 

@@ -18,8 +18,8 @@ from conftest import experiment, problem
 
 import jaxcal
 from jaxcal import Options
+from jaxcal.calibration.calibrate import Request, prepare
 from jaxcal.calibration.conventional import closed_form_answer
-from jaxcal.calibration.options import Request, prepare
 from jaxcal.cli.main import main
 
 METHOD = "conventional"

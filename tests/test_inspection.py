@@ -12,12 +12,12 @@ from conftest import problem
 from scipy import stats
 
 import jaxcal
-from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns
+from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns, quadratic
 from jaxcal.diagnostics.misfits import MISFIT_SCORE, noise_model
 from jaxcal.diagnostics.outliers import suspects
 from jaxcal.diagnostics.residual_checks import check_noise_model, kurtosis_score, skewness_score
 from jaxcal.diagnostics.sd_by_place import relative_sd
-from jaxcal.diagnostics.uncertainty import inverses, quadratic
+from jaxcal.diagnostics.uncertainty import inverses
 from jaxcal.model.batch import ImagePlanes, Iterate
 from jaxcal.model.observations import Points
 from jaxcal.model.parameters import Parameters

@@ -14,7 +14,7 @@ import pytest
 from conftest import experiment
 
 import jaxcal
-from jaxcal.calibration.options import as_problem
+from jaxcal.data.problem import as_problem
 from jaxcal.report import plots
 from jaxcal.report.record import calibration_record
 from jaxcal.result.saved import load_calibration

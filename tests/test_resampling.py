@@ -106,6 +106,15 @@ def test_bootstrap_scatters_as_the_covariance_says(data, whole):
 
 
 @pytest.mark.slow
+def test_an_images_bound_is_drawn_with_it(data):
+    bound = np.linspace(0.2, 4.0, COUNT)
+    asked: dict[str, Any] = {"method": "joint", "prior": "bounded"}
+    given = bootstrap(data, 4, **asked, max_elevation=bound)
+    held = bootstrap(replace(data, max_elevation=jnp.asarray(bound)), 4, **asked)
+    np.testing.assert_array_equal(given.image_to_probe, held.image_to_probe)
+
+
+@pytest.mark.slow
 def test_bootstrap_draws_used_images_only(data):
     half = replace(data, mask=data.mask.at[10:].set(0.0))
     wild = replace(half, measurements=half.measurements.at[10:].set(1e4))

@@ -18,7 +18,7 @@ import pytest
 
 import jaxcal
 from jaxcal import FormatError, InputError, Options
-from jaxcal.calibration.options import Request, check_request
+from jaxcal.calibration.calibrate import Request, check_request
 from jaxcal.cli.main import main
 from jaxcal.data.poses import rotation_angle
 from jaxcal.diagnostics.metrics import reconstruction_precision

@@ -24,9 +24,8 @@ from jaxcal.data.recording import (
 )
 from jaxcal.data.segmentation.segment import MINIMUM_LINES, check_times_of_flight
 from jaxcal.result.calibration import Calibration
-from jaxcal.runtime.arrays import real_array
-from jaxcal.runtime.buckets import cut
-from jaxcal.runtime.given_values import whole_number
+from jaxcal.runtime.arrays import first_images
+from jaxcal.runtime.given_values import real_array, whole_number
 from jaxcal.runtime.messages import shown
 
 MOST_IMAGES = 100_000
@@ -184,4 +183,4 @@ class LiveCalibration:
             InputError: as :meth:`problem`.
         """
         result = calibrate(self.problem(), **self._arguments)
-        return cut(result.numpy(), self._count)
+        return first_images(result.numpy(), self._count)

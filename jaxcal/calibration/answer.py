@@ -34,7 +34,6 @@ from jaxcal.model.unknowns import EXTRA, TABLE, Blocks, block_slice, measured, s
 from jaxcal.result.calibration import Calibration, Linearisation, Medium, Status
 from jaxcal.solvers.convergence import Convergence
 from jaxcal.solvers.dense import inverse_lanes_last
-from jaxcal.solvers.methods import nominal_sound_speed
 from jaxcal.solvers.plan import Given, SolvePlan
 
 LEAST_GAP_MM = 1e-6
@@ -449,7 +448,7 @@ def _medium(
     plan: SolvePlan,
 ) -> Medium | None:
     """Sound speed and delay in their units, with SDs; None where neither was estimated."""
-    blocks, speed = plan.blocks, nominal_sound_speed(problem)
+    blocks, speed = plan.blocks, problem.nominal_sound_speed
     found: dict[str, Array | None] = {}
 
     def believed(which: int) -> Array | None:

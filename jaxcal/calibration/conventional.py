@@ -17,13 +17,12 @@ from dataclasses import replace
 import numpy as np
 
 from jaxcal.data.problem import Problem
-from jaxcal.data.sound import WATER_M_S
 from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns
 from jaxcal.diagnostics.uncertainty import LARGEST_SD, inverses, mm_at_target, threshold
 from jaxcal.model.unknowns import EXTRA, block_slice, size
 from jaxcal.result.calibration import Calibration, Linearisation, Medium, Status
 from jaxcal.runtime.array_types import Float
-from jaxcal.runtime.trees import map_arrays
+from jaxcal.runtime.arrays import map_arrays
 from jaxcal.solvers.closed_form.reduced_objective import CONSTRAINTS
 from jaxcal.solvers.closed_form.single import ClosedForm, solve_problem
 from jaxcal.solvers.convergence import Convergence
@@ -159,8 +158,7 @@ def _medium(
     """The sound speed, where it was estimated."""
     if "sound-speed" not in plan.blocks:
         return None
-    nominal = WATER_M_S if problem.sound_speed is None else float(problem.sound_speed)
-    speed = nominal * found.sound_speed_factor
+    speed = float(problem.nominal_sound_speed) * found.sound_speed_factor
     at = block_slice(plan.blocks, "sound-speed").start
     return Medium(
         sound_speed_m_s=np.asarray(speed),

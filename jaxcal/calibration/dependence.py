@@ -39,6 +39,7 @@ import numpy as np
 from jaxcal import InputError
 from jaxcal.data.poses import nearest_rotations, targets_in_images
 from jaxcal.data.recording import MINIMUM_IMAGES
+from jaxcal.model.thresholds import MAD
 from jaxcal.runtime.array_types import Bool, Float, Int
 from jaxcal.runtime.arrays import like
 from jaxcal.solvers.closed_form.reduced_objective import knows_spacing
@@ -403,7 +404,7 @@ def _moves_continuously(poses: Float[np.ndarray, "n 4 4"]) -> bool:
 def clipped(errors: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
     """Errors less their mean, after clipping at three robust SDs from the median."""
     middle = np.median(errors, axis=0)
-    limit = 3 * 1.4826 * np.median(np.abs(errors - middle), axis=0)
+    limit = 3 * MAD * np.median(np.abs(errors - middle), axis=0)
     cut = np.clip(errors, middle - limit, middle + limit)
     return cut - cut.mean(axis=0)
 

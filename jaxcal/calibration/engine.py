@@ -1,26 +1,27 @@
 """What solves a problem or a batch by the engine: a kept program on a CPU, else one of JAX's own.
 
 On a CPU, machine code is kept between processes (:mod:`jaxcal.runtime.executables`) in sizes that
-serve many problems (:mod:`jaxcal.runtime.buckets`); a program that is found there is neither
+serve many problems; a program that is found there is neither
 imported, traced nor compiled. On other devices, inside somebody's jit, vmap or grad, and with a
 solver of the caller's own, JAX compiles :mod:`jaxcal.calibration.programs` as it compiles anything.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.data.problem import Problem, fill_up
+from jaxcal.data.problem import Problem, taken
 from jaxcal.result.calibration import Calibration
-from jaxcal.runtime import buckets, compiler, executables
+from jaxcal.runtime import compiler, executables
+from jaxcal.runtime.arrays import assembled, first_images, map_arrays
+from jaxcal.runtime.executables import bucket
 from jaxcal.runtime.precision import in_own_modes, inside_transformation
-from jaxcal.runtime.trees import map_arrays
-from jaxcal.solvers.closed_form.start import closed_form_start
+from jaxcal.solvers.closed_form.single import closed_form_start
 from jaxcal.solvers.plan import Given, SolvePlan
 
 T = TypeVar("T")
@@ -88,7 +89,20 @@ def _solve_kept(problem: Problem, given: Given, plan: SolvePlan) -> Calibration:
     start = None if plan.method == "conventional" else closed_form_start(used, plan.blocks)
     arguments = (padded, given, agreed, start)
     result = run("jaxcal.calibration.programs:solve_one", arguments, plan, label=label)
-    return as_jax_holds(buckets.cut(result, problem.images), problem)
+    return as_jax_holds(first_images(result, problem.images), problem)
+
+
+def fill_up(problem: Problem) -> Problem:
+    """A problem or batch with masked images up to its bucket's size; numpy arrays if it grows."""
+    more = bucket(problem.images) - problem.images
+    if not more:
+        return problem
+    rows = [*range(problem.images), *[problem.images - 1] * more]  # a masked pose must be rigid
+    mask = np.asarray(problem.mask)
+    mask = np.concatenate([mask, np.zeros((*mask.shape[:-1], more), mask.dtype)], axis=-1)
+    longer = taken(problem, rows)
+    parts = {field.name: getattr(longer, field.name) for field in fields(longer)}
+    return assembled(Problem, parts | {"mask": mask})
 
 
 @in_own_modes
@@ -152,13 +166,13 @@ def _solve_chunks_kept(
         arrays, which may go on behind the last problem, and False.
     """
     count, images = problems.mask.shape
-    chunk = min(buckets.size(count), largest)
+    chunk = min(bucket(count), largest)
     pieces = -(-count // chunk)
     padded = problems
     if count <= FEW_PROBLEMS:
         # Here a person waits for the compiler; of thousands, masked images would cost run time.
         padded = fill_up(problems)
-    size = buckets.size(pieces) if pieces > 1 else 1
+    size = bucket(pieces) if pieces > 1 else 1
     done = last and size * chunk == count and padded.images == images
     if size * chunk != count:
         # A copy of everything, which costs as much as the cheapest solves.
@@ -173,7 +187,7 @@ def _solve_chunks_kept(
         label=label,
         hold=partial(_kept_as_jax_holds, problem=problems) if done else executables.in_numpy,
     )
-    return (result, True) if done else (buckets.cut(result, images), False)
+    return (result, True) if done else (first_images(result, images), False)
 
 
 def _solve_chunks_compiled(

@@ -29,9 +29,9 @@ from jaxcal.diagnostics.uncertainty import LARGEST_SD, Spectra
 from jaxcal.model.parameters import Parameters, retract
 from jaxcal.model.residuals import target_in_image
 from jaxcal.result.calibration import Status
-from jaxcal.runtime import buckets, compiler, executables
-from jaxcal.runtime.arrays import is_traced, real_array
-from jaxcal.runtime.given_values import check_flag
+from jaxcal.runtime import compiler, executables
+from jaxcal.runtime.arrays import first_images, is_traced
+from jaxcal.runtime.given_values import check_flag, real_array
 from jaxcal.runtime.precision import in_own_modes, inside_transformation, require_float64
 from jaxcal.solvers import dense
 from jaxcal.solvers.consensus import (
@@ -264,13 +264,13 @@ def _solve_kept(
 ) -> Pivot:
     """One calibration by a kept program, which solves every number of poses of its bucket."""
     count = len(mask)
-    padded = buckets.size(count)
+    padded = executables.bucket(count)
     rows = np.minimum(np.arange(padded), count - 1)  # masked poses must be valid, too
     weight = np.where(np.arange(padded) < count, mask[rows], 0.0)
     label = {"method": "pivot", "images": padded, "robust": robust}
     arguments = (poses[rows], weight)
     found = executables.run(_solve_all, arguments, robust, flags=compiler.ONE_PROBLEM, label=label)
-    return buckets.cut(found, count)
+    return first_images(found, count)
 
 
 def _solve_all(

@@ -19,7 +19,7 @@ from jaxcal.calibration.pipeline import solve_problems
 from jaxcal.data.problem import Problem
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime import compiler
-from jaxcal.solvers.closed_form.start import Start
+from jaxcal.solvers.closed_form.single import Start
 from jaxcal.solvers.plan import Given, SolvePlan
 from jaxcal.solvers.start import GivenStart
 

@@ -24,20 +24,18 @@ from jaxtyping import Array, Float, Int, Key
 from jaxcal import InputError
 from jaxcal.calibration.calibrate import calibrate, calibrate_batch
 from jaxcal.calibration.dependence import independent
-from jaxcal.calibration.options import as_problem
-from jaxcal.data.problem import Problem
+from jaxcal.data.problem import Problem, as_problem
 from jaxcal.data.recording import MINIMUM_IMAGES, Recording
 from jaxcal.diagnostics.metrics import calibration_reproducibility
 from jaxcal.model.parameters import Parameters
 from jaxcal.model.residuals import measured_points, measurement_residual
+from jaxcal.model.thresholds import MAD
 from jaxcal.result.calibration import Calibration
-from jaxcal.runtime import buckets
-from jaxcal.runtime.arrays import is_traced
+from jaxcal.runtime.arrays import each_image, is_traced
 from jaxcal.runtime.given_values import LARGEST_SEED, check_key, check_made, whole_number
 from jaxcal.runtime.messages import shown
 from jaxcal.runtime.precision import in_own_modes
 from jaxcal.solvers import dense
-from jaxcal.solvers.methods import nominal_sound_speed
 
 LARGEST_RESAMPLES = 100_000
 
@@ -215,6 +213,9 @@ def bootstrap(
     rows = _rows(root, mask, resamples)
     # Each draw has as many images as were used, since the mask leaves out the other rows.
     options: dict[str, Any] = {**arguments, "robust": False}
+    bound: Any = options.get("max_elevation")
+    if np.shape(bound) == (problem.images,):
+        options["max_elevation"] = jnp.asarray(bound)[rows]  # drawn with its image
     fits = calibrate_batch(_drawn(problem, rows, mask), **options)
     _check_alike(result, fits)
     return _scatter(problem, result, fits)
@@ -249,7 +250,7 @@ def _scatter(problem: Problem, result: Calibration, fits: Calibration) -> Bootst
     return Bootstrap(
         image_to_probe=drawn,
         converged=converged,
-        spread=1.4826 * jnp.nanmedian(moved, axis=0),
+        spread=MAD * jnp.nanmedian(moved, axis=0),
         reproducibility=jnp.asarray(calibration_reproducibility(transforms, points)) / share,
         image_points=points,
     )
@@ -356,7 +357,7 @@ def _drawn(problem: Problem, rows: Array, mask: Float[Array, " n"]) -> Problem:
     """The problem with other rows of images in each of k copies."""
 
     def drawn(rows: Int[Array, " n"]) -> Problem:
-        found = buckets.each_image(problem, lambda values, axis: jnp.take(values, rows, axis))
+        found = each_image(problem, lambda values, axis: jnp.take(values, rows, axis))
         return replace(found, mask=mask)
 
     return jax.vmap(drawn)(rows)
@@ -368,7 +369,7 @@ def _parameters(result: Calibration, problem: Problem) -> Parameters:
     if result.scale_mm_per_px is not None:
         scale = jnp.asarray(result.scale_mm_per_px / problem.spacing)
     found = Parameters.of(matrix[:3, :3], matrix[:3, 3], jnp.asarray(result.point), scale)
-    nominal = nominal_sound_speed(problem)
+    nominal = problem.nominal_sound_speed
     if result.sound_speed_m_s is not None:
         found = replace(found, sound_speed=result.sound_speed_m_s / nominal)
     if result.delay_s is not None:

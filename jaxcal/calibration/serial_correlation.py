@@ -26,11 +26,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxcal.diagnostics.image_errors import ImageErrors
-from jaxcal.diagnostics.uncertainty import TUNED, Whitened
+from jaxcal.diagnostics.image_errors import ImageErrors, Whitened
 from jaxcal.runtime.array_types import Float
-from jaxcal.runtime.arrays import like
-from jaxcal.runtime.trees import map_arrays
+from jaxcal.runtime.arrays import like, map_arrays
+from jaxcal.solvers.plan import TUNED
 
 if TYPE_CHECKING:
     from jaxcal.result.calibration import Calibration

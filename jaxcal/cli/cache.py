@@ -105,14 +105,13 @@ def warm(
         program_cache.private_folder()
     except (OSError, RuntimeError) as error:
         raise OutputError(f"the cache cannot be used: {error}") from error
-    from jaxcal.calibration.calibrate import calibrate
-    from jaxcal.calibration.options import unknown_names
-    from jaxcal.runtime.buckets import size
+    from jaxcal.calibration.calibrate import calibrate, unknown_names
+    from jaxcal.runtime.executables import bucket
 
     names = unknown_names(estimate)
     like = _problem(recording, "scale" in names)
     for method in methods:
-        for count in sorted({size(count) for count in images}):
+        for count in sorted({bucket(count) for count in images}):
             with progress(f"compiling ({method}, {count} images)"):
                 began = time.perf_counter()
                 calibrate(_repeated(like, count), method, estimate=names)

@@ -27,7 +27,7 @@ from jaxcal.cli.common import (
 from jaxcal.solvers.names import Data, Method, PriorName, SolverName
 
 if TYPE_CHECKING:
-    from jaxcal.calibration.options import Request
+    from jaxcal.calibration.calibrate import Request
     from jaxcal.data.recording import Recording
     from jaxcal.report.convergence import Curve
     from jaxcal.result.calibration import Calibration
@@ -190,7 +190,12 @@ def calibrate(
     inputs = [recording] if test is None else [recording, test]
     targets = [_export_target(export, inputs, out) for export in exports]
     import_engine()
-    from jaxcal.calibration.options import Request, check_alternation, check_request, unknown_names
+    from jaxcal.calibration.calibrate import (
+        Request,
+        check_alternation,
+        check_request,
+        unknown_names,
+    )
     from jaxcal.solvers.plan import Options
 
     alternation = {

@@ -247,8 +247,7 @@ def _from_recording(
     seed: int,
 ) -> tuple[Any, Candidates]:
     from jaxcal import design
-    from jaxcal.calibration.calibrate import calibrate
-    from jaxcal.calibration.options import unknown_names
+    from jaxcal.calibration.calibrate import calibrate, unknown_names
     from jaxcal.data.probe import PRESETS
     from jaxcal.io.hdf5 import load
     from jaxcal.report.next_poses import NOT_PLANNED

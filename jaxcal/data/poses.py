@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxcal import InputError
 from jaxcal.runtime.array_types import Float
-from jaxcal.runtime.arrays import real_array
+from jaxcal.runtime.given_values import real_array
 
 ROTATION_TOLERANCE = 1e-2
 """Largest Frobenius distance from SO(3) that counts as rounding."""

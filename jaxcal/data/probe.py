@@ -17,7 +17,7 @@ import numpy as np
 from jaxcal import InputError
 from jaxcal.data.sound import check_sound_speed
 from jaxcal.runtime.array_types import Bool, Float, Num
-from jaxcal.runtime.arrays import is_number, real_array
+from jaxcal.runtime.given_values import is_number, real_array
 
 MOST_ELEMENTS = 65536
 _LONGEST_DELAY_S = 1e-3

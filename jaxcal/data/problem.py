@@ -7,24 +7,34 @@ same class with leading axes on every array.
 
 from __future__ import annotations
 
+import os
 import sys
-from dataclasses import fields, replace
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from dataclasses import replace
+from functools import wraps
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 import numpy as np
 
 from jaxcal import InputError
 from jaxcal.data.probe import CurvilinearProbe
-from jaxcal.data.recording import Images, Kind, Recording, images_of, make_images
-from jaxcal.runtime import buckets
+from jaxcal.data.recording import MINIMUM_IMAGES, Images, Kind, Recording, images_of, make_images
+from jaxcal.data.sound import WATER_M_S
 from jaxcal.runtime.array_types import AnyArray, Float, HeldArray
-from jaxcal.runtime.arrays import array_module, is_traced
+from jaxcal.runtime.arrays import array_module, array_tree, each_image, is_traced, static
 from jaxcal.runtime.messages import shown
 from jaxcal.runtime.precision import importing_jax, in_own_modes
-from jaxcal.runtime.trees import array_tree, assembled, static
 
 if TYPE_CHECKING:
     from jax.typing import DTypeLike
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+_HOW = (
+    "jaxcal.Problem.from_arrays(poses, measurements) makes one of arrays, jaxcal.load(path) reads "
+    "a recording"
+)
 
 
 @array_tree
@@ -97,6 +107,14 @@ class Problem:
     def batch_shape(self) -> tuple[int, ...]:
         """Leading axes; () for one problem."""
         return self.mask.shape[:-1]
+
+    @property
+    def nominal_sound_speed(self) -> Float[HeldArray, "*batch"]:
+        """The speed by which times of flight became distances, m/s; water's where unknown."""
+        if self.sound_speed is None:
+            xp = array_module(self.mask)
+            return xp.full(self.batch_shape, WATER_M_S, self.mask.dtype)
+        return self.sound_speed
 
     def cleared(self, used: Float[AnyArray, "*batch n"]) -> Problem:
         """The problem with harmless values in images that are not used: NaN times 0 is NaN, not 0.
@@ -247,22 +265,9 @@ def _floating(dtype: DTypeLike | None) -> np.dtype:
     return found
 
 
-def fill_up(problem: Problem) -> Problem:
-    """A problem or batch with masked images up to its bucket's size; numpy arrays if it grows."""
-    more = buckets.size(problem.images) - problem.images
-    if not more:
-        return problem
-    rows = [*range(problem.images), *[problem.images - 1] * more]  # a masked pose must be rigid
-    mask = np.asarray(problem.mask)
-    mask = np.concatenate([mask, np.zeros((*mask.shape[:-1], more), mask.dtype)], axis=-1)
-    longer = taken(problem, rows)
-    parts = {field.name: getattr(longer, field.name) for field in fields(longer)}
-    return assembled(Problem, parts | {"mask": mask})
-
-
 def taken(problem: Problem, rows: list[int]) -> Problem:
     """Some images of one problem, in numpy arrays; an image may be taken several times."""
-    return buckets.each_image(problem, lambda values, axis: np.take(np.asarray(values), rows, axis))
+    return each_image(problem, lambda values, axis: np.take(np.asarray(values), rows, axis))
 
 
 @importing_jax
@@ -301,3 +306,127 @@ def stack(problems: list[Problem]) -> Problem:
         return jax.device_put(np.stack(leaves), *kept)
 
     return jax.tree.map(stacked, *problems)
+
+
+def as_problem(value: Any, name: str) -> Problem:
+    """The problem that a caller gave; recordings and images are converted.
+
+    Args:
+        value: a problem, a recording or one set of images.
+        name: of the function that was called, for messages.
+
+    Raises:
+        InputError: anything else, with what to do.
+    """
+    if isinstance(value, Problem):
+        return value
+    if isinstance(value, Recording | Images):
+        return Problem.from_recording(value)
+    if isinstance(value, str | os.PathLike):
+        raise InputError(
+            f"{name} takes a problem, not a path: {name}(jaxcal.load({os.fspath(value)!r})), or "
+            "import the file first (jaxcal import)"
+        )
+    if isinstance(value, list | tuple) and value and _are_problems(value):
+        raise InputError(
+            f"{name} takes one problem, not {len(value)}: jaxcal.calibrate_batch takes a list"
+        )
+    kind = "a dictionary" if isinstance(value, dict) else f"{type(value).__name__}"
+    raise InputError(f"{name} takes a problem or a recording, not {kind}: {_HOW}")
+
+
+def as_batch(value: Any, name: str) -> Problem:
+    """The batch of problems that a caller gave; a list of problems or recordings is stacked.
+
+    Raises:
+        InputError: anything else, or problems that differ in their number of images or in parts.
+    """
+    if isinstance(value, list | tuple):
+        if not value:
+            raise InputError(f"{name} takes at least one problem; the list is empty")
+        return stack([as_problem(each, name) for each in value])
+    return as_problem(value, name)
+
+
+def _are_problems(values: Any) -> bool:
+    return all(isinstance(each, Problem | Recording | Images) for each in values)
+
+
+def converting(function: Callable[P, T]) -> Callable[P, T]:
+    """Decorate a public function whose first argument is a problem: it takes recordings as well.
+
+    Placed outside :func:`jaxcal.runtime.precision.in_own_modes`: to segment times of flight imports
+    JAX, and what imports JAX within would run in the caller's modes.
+    """
+
+    @wraps(function)
+    def converted(*args: P.args, **kwargs: P.kwargs) -> T:
+        name = f"jaxcal.{function.__name__}"
+        if args:
+            return function(*(as_problem(args[0], name), *args[1:]), **kwargs)  # pyright: ignore[reportCallIssue]
+        if "problem" in kwargs:
+            kwargs["problem"] = as_problem(kwargs["problem"], name)
+        return function(*args, **kwargs)
+
+    return converted
+
+
+def check_shapes(problem: Problem) -> None:
+    """Refuse arrays that do not go together, as ``dataclasses.replace`` may leave a problem.
+
+    Raises:
+        InputError: what is no array of real numbers, or has another shape than the mask asks for.
+    """
+    shape = tuple(np.shape(problem.mask))
+    batch = shape[:-1]
+    if not shape:
+        raise InputError("mask of the problem must have an axis for the images")
+    for name, wanted, optional in (
+        ("mask", shape, False),
+        ("poses", (*shape, 4, 4), False),
+        ("measurements", (*shape, 2), False),
+        ("spacing", (*batch, 2), False),
+        ("face_offset", batch, False),
+        ("covariance", (*shape, 2, 2), True),
+        ("max_elevation", shape, True),
+    ):
+        value = getattr(problem, name)
+        if value is None and optional:
+            continue
+        kind = getattr(getattr(value, "dtype", None), "kind", "")
+        # bfloat16 and its like are of numpy's kind V.
+        if value is None or kind not in ("f", "V"):
+            raise InputError(f"{name} of the problem must be an array of real numbers")
+        if np.shape(value) != wanted:
+            raise InputError(
+                f"{name} of the problem must have shape {wanted}, not {np.shape(value)}"
+            )
+
+
+def check_values(problem: Problem) -> None:
+    """Refuse NaN, Inf and too few images, if the values are concrete.
+
+    Raises:
+        InputError: a mask of other numbers than 0 and 1, NaN or Inf, with the number of the image,
+            too few images, or pixels without a size.
+    """
+    if is_traced(problem):
+        return
+    mask = np.asarray(problem.mask)
+    if not np.isin(mask, (0, 1)).all():
+        raise InputError("mask of the problem must hold 1 (used) or 0 (left out) for every image")
+    used = mask > 0
+    if used.sum() < MINIMUM_IMAGES:
+        raise InputError(
+            f"{int(used.sum())} used images are too few: at least {MINIMUM_IMAGES} are needed"
+        )
+    for name in ("poses", "measurements"):
+        values = np.asarray(getattr(problem, name))
+        bad = ~np.isfinite(values).reshape(len(used), -1).all(axis=1) & used
+        if bad.any():
+            raise InputError(f"{name} of image {np.flatnonzero(bad)[0]} hold NaN or Inf")
+    spacing = np.asarray(problem.spacing)
+    if not (np.isfinite(spacing).all() and (spacing > 0).all()):
+        raise InputError(f"spacing of the problem must be two positive numbers, not {spacing}")
+    if not np.isfinite(np.asarray(problem.face_offset)):
+        raise InputError("face_offset of the problem must be finite")

@@ -16,7 +16,8 @@ from jaxcal import InputError
 from jaxcal.data.poses import check_poses
 from jaxcal.data.probe import Probe, check_probe
 from jaxcal.runtime.array_types import Bool, Float
-from jaxcal.runtime.arrays import is_number, is_traced, real_array
+from jaxcal.runtime.arrays import is_traced
+from jaxcal.runtime.given_values import is_number, real_array
 from jaxcal.runtime.messages import shown
 
 MINIMUM_IMAGES = 4

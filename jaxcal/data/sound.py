@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxcal import InputError
 from jaxcal.runtime.array_types import Float
-from jaxcal.runtime.arrays import is_number, real_array
+from jaxcal.runtime.given_values import is_number, real_array
 
 # W. Marczak, "Water as a standard in the measurements of speed of sound in liquids",
 # J. Acoust. Soc. Am. 102 (1997) 2776-2779: fifth degree in degrees Celsius, lowest power first.

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from jaxcal import InputError
 from jaxcal.data.poses import check_poses
-from jaxcal.runtime.arrays import is_number, real_array
+from jaxcal.runtime.given_values import is_number, real_array
 from jaxcal.runtime.messages import seconds
 
 MINIMUM_MOTION_MM = 8.0

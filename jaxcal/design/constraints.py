@@ -24,8 +24,7 @@ from jaxcal import InputError
 from jaxcal.data.poses import rotations_from_vectors, targets_in_images
 from jaxcal.data.probe import CurvilinearProbe, Probe, check_probe
 from jaxcal.runtime.array_types import Bool, Float
-from jaxcal.runtime.arrays import is_number, real_array
-from jaxcal.runtime.given_values import check_made
+from jaxcal.runtime.given_values import check_made, is_number, real_array
 from jaxcal.runtime.messages import shown
 
 _INSIDE = 1e-9

@@ -12,7 +12,7 @@ from jaxcal import InputError
 from jaxcal.design.candidates import Candidates
 from jaxcal.design.greedy import MOST_POSES
 from jaxcal.design.planning import Plan, next_poses
-from jaxcal.runtime.arrays import is_number
+from jaxcal.runtime.given_values import is_number
 
 if TYPE_CHECKING:
     from jaxcal.result.calibration import Calibration

@@ -9,8 +9,7 @@ import numpy as np
 
 from jaxcal import InputError
 from jaxcal.design.planning import Plan
-from jaxcal.runtime.arrays import is_number
-from jaxcal.runtime.given_values import check_made
+from jaxcal.runtime.given_values import check_made, is_number
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

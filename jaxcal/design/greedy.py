@@ -21,8 +21,7 @@ from jaxcal.design.candidates import Candidates
 from jaxcal.design.criteria import gains
 from jaxcal.design.information import covariance_of
 from jaxcal.runtime.array_types import Bool, Float
-from jaxcal.runtime.arrays import is_number
-from jaxcal.runtime.given_values import whole_number
+from jaxcal.runtime.given_values import is_number, whole_number
 
 MOST_POSES = 2000
 """Of one plan."""

@@ -24,8 +24,8 @@ from jaxcal.data.poses import check_poses, targets_in_images
 from jaxcal.design.noise import Noise, check_result, used_images
 from jaxcal.model.unknowns import RIGID, block_slice
 from jaxcal.runtime.array_types import Float
-from jaxcal.runtime.arrays import is_number, is_traced, real_array
-from jaxcal.runtime.given_values import check_flag, check_made
+from jaxcal.runtime.arrays import is_traced
+from jaxcal.runtime.given_values import check_flag, check_made, is_number, real_array
 
 if TYPE_CHECKING:
     from jaxcal.result.calibration import Calibration

@@ -18,8 +18,8 @@ from jaxcal import InputError
 from jaxcal.data.probe import Probe, check_probe
 from jaxcal.diagnostics.sd_by_place import basis_at, log_sd_slopes
 from jaxcal.runtime.array_types import Bool, Float
-from jaxcal.runtime.arrays import is_number, is_traced, real_array
-from jaxcal.runtime.given_values import check_made
+from jaxcal.runtime.arrays import is_traced
+from jaxcal.runtime.given_values import check_made, is_number, real_array
 
 if TYPE_CHECKING:
     from jaxcal.result.calibration import Calibration

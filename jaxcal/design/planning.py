@@ -30,8 +30,7 @@ from jaxcal.design.noise import SD_RANGE_MM, Noise, check_result
 from jaxcal.design.predict import curve
 from jaxcal.diagnostics.directions import direction_in_words
 from jaxcal.runtime.array_types import Bool, Float
-from jaxcal.runtime.arrays import real_array
-from jaxcal.runtime.given_values import check_flag, check_made, whole_number
+from jaxcal.runtime.given_values import check_flag, check_made, real_array, whole_number
 
 if TYPE_CHECKING:
     from jaxcal.result.calibration import Calibration

@@ -19,8 +19,7 @@ from jaxcal.design.candidates import Candidates
 from jaxcal.design.planning import Plan
 from jaxcal.diagnostics.metrics import reconstruction_precision
 from jaxcal.runtime.array_types import Float
-from jaxcal.runtime.arrays import real_array
-from jaxcal.runtime.given_values import LARGEST_SEED, check_made, whole_number
+from jaxcal.runtime.given_values import LARGEST_SEED, check_made, real_array, whole_number
 from jaxcal.runtime.precision import importing_jax, in_own_modes
 
 if TYPE_CHECKING:

@@ -29,17 +29,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxcal import CalibrationError
-from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns
-from jaxcal.diagnostics.uncertainty import (
-    TUNED,
+from jaxcal.diagnostics.image_errors import (
+    ImageErrors,
+    Unknowns,
     Whitened,
-    inverses,
     own_covariance,
     quadratic,
 )
+from jaxcal.diagnostics.uncertainty import inverses
 from jaxcal.model.unknowns import heard
 from jaxcal.runtime.array_types import Bool, Float, Int
-from jaxcal.runtime.trees import map_arrays
+from jaxcal.runtime.arrays import map_arrays
+from jaxcal.solvers.plan import TUNED
 
 if TYPE_CHECKING:
     from jaxcal.data.problem import Problem

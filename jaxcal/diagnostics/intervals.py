@@ -33,11 +33,13 @@ from scipy import special
 
 from jaxcal import InputError
 from jaxcal.data.sound import WATER_M_S
-from jaxcal.diagnostics.uncertainty import TUNED
 from jaxcal.model.image_points import mean_of_squares, point_jacobian
 from jaxcal.model.unknowns import in_image, size
 from jaxcal.runtime.array_types import AnyArray, Float
-from jaxcal.runtime.arrays import array_module, is_number, is_traced, real_array, traceable
+from jaxcal.runtime.arrays import array_module, is_traced
+from jaxcal.runtime.given_values import is_number, real_array
+from jaxcal.runtime.precision import traceable
+from jaxcal.solvers.plan import TUNED
 
 if TYPE_CHECKING:
     from jaxcal.result.calibration import Calibration
@@ -167,7 +169,7 @@ def range_of_row_zero(
     face, before, nominal = 0.0, 0.0, WATER_M_S
     if problem is not None:
         face = problem.face_offset
-        nominal = WATER_M_S if problem.sound_speed is None else problem.sound_speed
+        nominal = problem.nominal_sound_speed
         before = 0.0 if problem.delay is None else problem.delay
     one = xp.ones(np.shape(calibration.mask)[:-1])
     speed, delay = one, 0.0

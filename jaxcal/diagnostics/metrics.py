@@ -8,7 +8,9 @@ import numpy as np
 
 from jaxcal import InputError
 from jaxcal.runtime.array_types import AnyArray, Bool, Float
-from jaxcal.runtime.arrays import array_module, is_traced, real_array, traceable
+from jaxcal.runtime.arrays import array_module, is_traced
+from jaxcal.runtime.given_values import real_array
+from jaxcal.runtime.precision import traceable
 
 
 @traceable

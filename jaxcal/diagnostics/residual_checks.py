@@ -24,13 +24,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxcal.diagnostics.image_errors import ImageErrors, motion
+from jaxcal.diagnostics.image_errors import ImageErrors, Whitened, motion, quadratic
 from jaxcal.diagnostics.sd_by_place import relative_sd
-from jaxcal.diagnostics.uncertainty import TUNED, Uncertainty, Whitened, inverses, quadratic
+from jaxcal.diagnostics.uncertainty import Uncertainty, inverses
 from jaxcal.model.thresholds import CUT, FEW_IMAGES, FEWEST_IMAGES, MAD, RELATIVE_FLOOR
 from jaxcal.model.unknowns import block_slice, further_derivatives, measured
 from jaxcal.result.findings import Inspection
 from jaxcal.runtime.array_types import Bool, Float
+from jaxcal.solvers.plan import TUNED
 
 if TYPE_CHECKING:
     from jaxcal.result.calibration import Calibration

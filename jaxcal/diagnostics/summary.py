@@ -12,7 +12,7 @@ from jaxcal.diagnostics.image_errors import ImageErrors
 from jaxcal.diagnostics.residual_checks import inspect
 from jaxcal.diagnostics.uncertainty import assess
 from jaxcal.result.findings import Inspection, Summary
-from jaxcal.runtime.trees import map_arrays
+from jaxcal.runtime.arrays import map_arrays
 
 if TYPE_CHECKING:
     from jaxcal.result.calibration import Calibration

@@ -21,14 +21,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jaxcal.diagnostics.image_errors import ImageErrors, Whitened, quadratic
 from jaxcal.model.thresholds import LARGEST_ELEVATION
 from jaxcal.model.unknowns import TABLE, block_slice
 from jaxcal.runtime.array_types import AnyArray, Bool, Float
 from jaxcal.runtime.arrays import array_module
-from jaxcal.solvers.plan import DEFAULT_MAX_ELEVATION_MM
+from jaxcal.solvers.plan import DEFAULT_MAX_ELEVATION_MM, TUNED
 
 if TYPE_CHECKING:
-    from jaxcal.diagnostics.image_errors import ImageErrors
     from jaxcal.model.unknowns import Blocks
     from jaxcal.result.calibration import Calibration
 
@@ -42,9 +42,6 @@ LARGEST_SD = 0.5
 
 AT_BOUND = 1e-12
 """An offset within this fraction of its bound counts as on it; the difference is rounding."""
-
-TUNED = ("gaussian", "auto", "uniform")
-"""Priors with SDs of lateral position, range and offset."""
 
 
 @dataclass(frozen=True)
@@ -218,11 +215,6 @@ def nearest_unknown(
     return picked / np.where(length > 0, length, 1.0)
 
 
-def quadratic(rows: Float[Array, "k m p"], matrix: Float[Array, "k p p"]) -> Float[Array, "k m"]:
-    """The quadratic form r' C r of every row r, with C the matrix."""
-    return np.einsum("kmp,kmp->km", rows @ matrix, rows)
-
-
 def _offsets(
     answer: Calibration,
     seen: ImageErrors,
@@ -257,88 +249,6 @@ def _offsets(
     else:
         total = size * quadratic(seen.rows[..., 2, :], inverse)
     return at_bound, np.where(kept, np.sqrt(np.where(kept, total, 1.0)), np.nan)
-
-
-@dataclass(frozen=True)
-class Whitened:
-    """Errors under a Gaussian prior, in SDs, decorrelated where images have their own covariances.
-
-    Attributes:
-        errors: of lateral position, range and offset.
-        rows: their derivatives by the shared unknowns.
-        offset: their derivatives by the image's own offset unknown, or None where there is no such
-            unknown (it belongs to a given tracker SD).
-        weight: D of that unknown; 1 if there is none.
-        pull: E / D, by which that unknown follows the shared ones; zeros if there is none.
-    """
-
-    errors: Float[Array, "k n 3"]
-    rows: Float[Array, "k n 3 p"]
-    offset: Float[Array, "k n 3"] | None
-    weight: Float[Array, "k n"]
-    pull: Float[Array, "k n p"]
-
-    @classmethod
-    def of(cls, answer: Calibration, seen: ImageErrors) -> Whitened:
-        """The errors of calibrations on points with Gaussian errors."""
-        sigma, tau = np.asarray(answer.sigma), answer.linearisation.tracker_sd
-        offset, shape = None, own_covariance(answer, seen)
-        if tau is not None:
-            sigma = np.hypot(sigma, tau[:, None] * [1.0, 1.0, 0.0])
-            far = np.hypot(seen.errors[..., 2], seen.q[..., 2])
-            one = np.ones_like(far)
-            offset = np.stack([0 * one, seen.errors[..., 2] / far, one], axis=-1)
-            offset = tau[:, None, None] * seen.mask[..., None] * offset
-        parts: list[Any] = [seen.errors[..., None], seen.rows]
-        parts += [] if offset is None else [offset[..., None]]
-        parts = [_decorrelated(np.asarray(p / sigma[:, None, :, None]), shape) for p in parts]
-        errors, rows = parts[0][..., 0], parts[1]
-        weight, pull = np.ones(seen.mask.shape), np.zeros_like(rows[..., 0, :])
-        if offset is not None:
-            offset = parts[2][..., 0]
-            weight = np.sum(offset**2, axis=-1) + 1
-            pull = np.einsum("knm,knmp->knp", offset, rows) / weight[..., None]
-        return cls(errors, rows, offset, weight, pull)
-
-    def leverage(self, inverse: Float[Array, "k p p"]) -> Float[Array, "k n 3"]:
-        """The share of each error's variance that the fit absorbs."""
-        rows, own = self.rows, 0.0
-        if self.offset is not None:
-            rows = rows - self.offset[..., None] * self.pull[:, :, None]
-            own = self.offset**2 / self.weight[..., None]
-        flat = rows.reshape(len(rows), -1, rows.shape[-1])
-        return quadratic(flat, inverse).reshape(rows.shape[:-1]) + own
-
-
-def own_covariance(answer: Calibration, seen: ImageErrors) -> Float[Array, "k n 2 2"] | None:
-    """The shape of the images' own covariances, if these whiten the errors; else None."""
-    given = seen.problem.covariance
-    if given is None:
-        return None
-    kept = np.asarray(answer.mask)[..., None] > 0
-    covariance = np.where(kept[..., None], given, np.eye(2))
-    variances = np.where(kept, np.diagonal(covariance, axis1=-2, axis2=-1), 0.0)
-    mean = variances.sum(axis=1) / kept.sum(axis=1)
-    shaped = (mean > 0).all(axis=1)
-    if answer.offset_law is not None:
-        shaped = shaped & (np.asarray(answer.offset_law.own_probability) > 0.5)
-    scale = 1 / np.sqrt(np.where(mean > 0, mean, 1.0))
-    shape = covariance * (scale[:, :, None] * scale[:, None])[:, None]
-    return np.where(shaped[:, None, None, None], shape, np.eye(2))
-
-
-def _decorrelated(
-    values: Float[Array, "k n 3 c"], shape: Float[Array, "k n 2 2"] | None
-) -> Float[Array, "k n 3 c"]:
-    """Rows multiplied by the inverse Cholesky factor of every image's 2x2 covariance."""
-    if shape is None:
-        return values
-    first = np.sqrt(shape[..., 0, 0])[..., None]
-    mixed = shape[..., 1, 0][..., None] / first
-    second = np.sqrt(shape[..., 1, 1][..., None] - mixed**2)
-    lateral = values[..., 0, :] / first
-    distance = (values[..., 1, :] - mixed * lateral) / second
-    return np.stack([lateral, distance, values[..., 2, :]], axis=-2)
 
 
 def _known_from_prior(

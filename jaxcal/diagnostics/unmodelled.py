@@ -28,10 +28,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxcal.diagnostics.image_errors import ImageErrors
-from jaxcal.diagnostics.uncertainty import TUNED, Whitened
+from jaxcal.diagnostics.image_errors import ImageErrors, Whitened
 from jaxcal.runtime.array_types import Bool, Float
-from jaxcal.runtime.trees import map_arrays
+from jaxcal.runtime.arrays import map_arrays
+from jaxcal.solvers.plan import TUNED
 
 if TYPE_CHECKING:
     from jaxcal.result.calibration import Calibration

@@ -9,8 +9,8 @@ import numpy as np
 from jaxcal.diagnostics.directions import check_one, observability
 from jaxcal.diagnostics.misfits import misfits
 from jaxcal.diagnostics.outliers import listed_departures, outliers, suspects_in_words
-from jaxcal.diagnostics.uncertainty import TUNED
 from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
+from jaxcal.solvers.plan import TUNED
 
 if TYPE_CHECKING:
     from jaxcal.result.calibration import Calibration

@@ -16,8 +16,7 @@ from jaxcal.io.sequence_header import (
     check_count,
     checked_pixels,
     header_lines,
-    image_type_of,
-    orientation_of,
+    orientation_and_kind,
     sequence_of,
     whole_numbers,
     written_orientation,
@@ -36,7 +35,7 @@ _META_TYPES = {
 
 def read_metaimage(path: Path, name: str) -> TrackedSequence:
     """Read a header; its errors do not name the file."""
-    header = SequenceHeader({}, {}, 0)
+    header = SequenceHeader()
     for line, text, end in header_lines(path):
         key, separator, value = text.partition("=")
         key, value = key.strip(), value.strip()
@@ -44,11 +43,7 @@ def read_metaimage(path: Path, name: str) -> TrackedSequence:
             continue
         if not separator:
             raise FormatError(f"line {line} is not KEY = VALUE: {quoted(text)}")
-        if header.take_frame_field(key, value, line):
-            continue
-        if header.fields.get(key, value) != value:
-            raise FormatError(f"line {line}: {quoted(key)} is given twice, with different values")
-        header.fields[key] = value
+        header.take(key, value, line)
         if key == "ElementDataFile":
             header.end = end
             break
@@ -86,7 +81,6 @@ def _metaimage_pixels(
         raise FormatError("holds pixels as text; only binary ones are read")
     big = _flag(fields, "BinaryDataByteOrderMSB", "ElementByteOrderMSB")
     dtype = _META_TYPES[fields["ElementType"]].newbyteorder(">" if big else "<")
-    image_type = image_type_of(fields.get("UltrasoundImageType", ""))
     data = fields["ElementDataFile"]
     pixels = Pixels(
         path if data == "LOCAL" else _beside(path, data),
@@ -96,8 +90,9 @@ def _metaimage_pixels(
         rows,
         whole_numbers(fields.get("ElementNumberOfChannels", "1"), "ElementNumberOfChannels")[0],
         dtype,
-        orientation_of(fields.get("UltrasoundImageOrientation", ""), image_type),
-        image_type,
+        *orientation_and_kind(
+            fields.get("UltrasoundImageOrientation", ""), fields.get("UltrasoundImageType", "")
+        ),
     )
     skipped = fields.get("HeaderSize", "0")
     if skipped != "0":

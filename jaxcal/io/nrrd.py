@@ -17,8 +17,7 @@ from jaxcal.io.sequence_header import (
     check_count,
     checked_pixels,
     header_lines,
-    image_type_of,
-    orientation_of,
+    orientation_and_kind,
     sequence_of,
     whole_numbers,
     written_orientation,
@@ -39,7 +38,7 @@ _DTYPES = {name: np.dtype(dtype) for dtype, names in _NRRD_TYPES.items() for nam
 
 def read_nrrd(path: Path, name: str) -> TrackedSequence:
     """Read a header; its errors do not name the file."""
-    header = SequenceHeader({}, {}, 0)
+    header = SequenceHeader()
     for line, text, end in header_lines(path):
         if line == 1:
             if not text.startswith("NRRD00"):
@@ -53,16 +52,11 @@ def read_nrrd(path: Path, name: str) -> TrackedSequence:
         own, found, value = text.partition(": ")
         key, pair, other = text.partition(":=")
         if pair and (not found or len(key) <= len(own)):
-            key, value = key.strip(), other.strip()
-            if header.take_frame_field(key, value, line):
-                continue
+            header.take(key.strip(), other.strip(), line)
         elif found:
-            key, value = own.strip().lower(), value.strip()
+            header.take(own.strip().lower(), value.strip(), line)
         else:
             raise FormatError(f"line {line} is not a field: {quoted(text)}")
-        if header.fields.get(key, value) != value:
-            raise FormatError(f"line {line}: {quoted(key)} is given twice, with different values")
-        header.fields[key] = value
     fields = header.fields
     if not header.end:
         raise FormatError(
@@ -149,7 +143,6 @@ def _nrrd_pixels(
         raise FormatError(f"encoding {quoted(encoding)} is not read: write raw or gzip")
     order = ">" if fields.get("endian", "little").lower() == "big" else "<"
     columns, rows, channels = size
-    image_type = image_type_of(fields.get("ultrasound image type", ""))
     return checked_pixels(
         Pixels(
             path,
@@ -159,14 +152,16 @@ def _nrrd_pixels(
             rows,
             channels,
             _DTYPES[kind].newbyteorder(order),
-            orientation_of(fields.get("ultrasound image orientation", ""), image_type),
-            image_type,
+            *orientation_and_kind(
+                fields.get("ultrasound image orientation", ""),
+                fields.get("ultrasound image type", ""),
+            ),
         ),
         count,
     )
 
 
-def nrrd_header(stack: np.ndarray, orientation: str, pixels: bool, compressed: bool) -> list[str]:
+def nrrd_header(stack: np.ndarray, orientation: str, compressed: bool) -> list[str]:
     """The lines of a header before the fields of frames."""
     colour = stack.ndim == 4
     sizes = f"{stack.shape[2]} {stack.shape[1]} {stack.shape[0]}"

@@ -73,13 +73,12 @@ def write_sequence(
     count = len(time)
     check_written(transforms, time)
     stack = stacked(images, count)
-    fields = [
-        frame_fields(index, transforms, valid, time, images is not None) for index in range(count)
-    ]
-    if name.lower().endswith(".nrrd"):
-        head = nrrd_header(stack, orientation, images is not None, compressed)
+    nrrd = name.lower().endswith(".nrrd")
+    status = None if images is None else "Status" if nrrd else "ImageStatus"
+    fields = [frame_fields(index, transforms, valid, time, status) for index in range(count)]
+    if nrrd:
+        head = nrrd_header(stack, orientation, compressed)
         lines = [f"{key}:={value}" for of_frame in fields for key, value in of_frame]
-        lines = [line.replace("_ImageStatus:=", "_Status:=") for line in lines]
         packed = packed_pixels(stack, "gzip" if compressed else "raw")
         content = "\n".join([*head, *lines, "", ""]).encode() + packed
         _put(path, content)

@@ -13,7 +13,7 @@ import math
 import re
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import cast
 
@@ -41,14 +41,18 @@ _FRAME_FIELD = re.compile(r"Seq_Frame(\d{1,18})_(.+)", re.DOTALL)
 class SequenceHeader:
     """Lines of a header: its own fields, those of frames, and where the pixels begin."""
 
-    fields: dict[str, str]
-    frames: dict[int, dict[str, tuple[str, int]]]
-    end: int
+    fields: dict[str, str] = field(default_factory=dict)
+    frames: dict[int, dict[str, tuple[str, int]]] = field(default_factory=dict)
+    end: int = 0
 
-    def take_frame_field(self, key: str, value: str, line: int) -> bool:
-        """Keep a field of a frame; False where the key is not one."""
+    def take(self, key: str, value: str, line: int) -> None:
+        """Keep a field of a frame, or one of the header's own."""
         if not key.startswith("Seq_Frame"):
-            return False
+            if self.fields.setdefault(key, value) != value:
+                raise FormatError(
+                    f"line {line}: {quoted(key)} is given twice, with different values"
+                )
+            return
         found = _FRAME_FIELD.fullmatch(key)
         if found is None:
             raise FormatError(f"line {line}: {quoted(key)} does not name a frame and a field")
@@ -59,7 +63,6 @@ class SequenceHeader:
         if found[2] in of_frame:
             raise FormatError(f"line {line}: {quoted(key)} is given twice")
         of_frame[found[2]] = (value, line)
-        return True
 
 
 def header_lines(path: Path) -> Iterator[tuple[int, str, int]]:
@@ -114,28 +117,32 @@ def check_count(count: int, header: SequenceHeader) -> None:
         raise FormatError(f"has fields of frame {min(beyond)}, but only {count} frames")
 
 
-def orientation_of(text: str, image_type: str) -> Orientation | None:
-    """The first two letters of an orientation; None for XX, ?? and nothing.
+def orientation_and_kind(text: str, kind: str) -> tuple[Orientation | None, str]:
+    """How pixels lie in their file, and what they are.
 
-    PLUS writes others (``FM``) for RF data alone, which are refused as such when asked for.
+    Args:
+        text: the orientation that a header states.
+        kind: the type of images that it states.
+
+    Returns:
+        The first two letters of the orientation, None for XX, ?? and nothing; ``BRIGHTNESS``, or
+        PLUS's name of another type. PLUS writes other orientations (``FM``) for RF data alone,
+        which are refused as such when asked for.
     """
+    # Missing means B-mode; Slicer writes the word twice.
+    kind = kind.strip()
+    if not kind or kind == "XX" or kind.startswith("BRIGHTNESS"):
+        kind = "BRIGHTNESS"
     stated = text.strip().upper()
     # The third letter, the direction of a volume's planes, follows from the others.
     if re.fullmatch("(MF|UF|MN|UN)[AD]?", stated):
-        return cast(Orientation, stated[:2])
-    if stated not in ("", "XX", "??") and image_type == "BRIGHTNESS":
+        return cast(Orientation, stated[:2]), kind
+    if stated not in ("", "XX", "??") and kind == "BRIGHTNESS":
         raise FormatError(
             f"orientation {quoted(text)} is not read: only MF, UF, MN and UN (write XX where it is "
             "not known)"
         )
-    return None
-
-
-def image_type_of(text: str) -> str:
-    """``BRIGHTNESS``, or PLUS's name of another type."""
-    # Missing means B-mode; Slicer writes the word twice.
-    text = text.strip()
-    return "BRIGHTNESS" if not text or text == "XX" or text.startswith("BRIGHTNESS") else text
+    return None, kind
 
 
 def sequence_of(
@@ -255,9 +262,9 @@ def frame_fields(
     transforms: Mapping[FramePair, np.ndarray],
     valid: Mapping[FramePair, np.ndarray] | None,
     time: np.ndarray,
-    pixels: bool,
+    image_status: str | None,
 ) -> list[tuple[str, str]]:
-    """Keys and values of one frame."""
+    """Keys and values of one frame; the image's status, where it has one, under this name."""
     start = f"Seq_Frame{index:04d}_"
     fields: list[tuple[str, str]] = []
     for pair, matrices in transforms.items():
@@ -270,8 +277,8 @@ def frame_fields(
         fields.append((key, " ".join(map(repr, numbers.ravel().tolist()))))
         fields.append((f"{key}Status", "OK" if good else "INVALID"))
     fields.append((f"{start}Timestamp", repr(float(time[index]))))
-    if pixels:
-        fields.append((f"{start}ImageStatus", "OK"))
+    if image_status is not None:
+        fields.append((f"{start}{image_status}", "OK"))
     return fields
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 from jaxcal.runtime.array_types import Bool, Float, HeldArray
-from jaxcal.runtime.trees import array_tree
+from jaxcal.runtime.arrays import array_tree
 
 Family = Literal["uniform", "bell", "gaussian", "student"]
 

@@ -496,12 +496,16 @@ class TrackedPoints(LocalUnknown):
         offset = q[1] + tau * local
         lateral, distance = errors([q[0], offset, q[2]], further, images)
         sigma = [value[:, None] for value in self.sigma]
-        wide = [jnp.hypot(sigma[0], tau), jnp.hypot(sigma[1], tau)]
-        one, other = lateral / wide[0], distance / wide[1]
-        if self.shape is not None:
-            first, mixed, last = factor_of(self.shape)
-            one = one / first
-            other = (other - mixed * one) / last
+        if self.shape is None:
+            one = lateral / jnp.hypot(sigma[0], tau)
+            other = distance / jnp.hypot(sigma[1], tau)
+        else:
+            # The tracker's error has one size, whatever the image's own covariance is.
+            mixed = sigma[0] * sigma[1] * self.shape[1]
+            variances = [sigma[k] ** 2 * self.shape[2 * k] + tau**2 for k in (0, 1)]
+            first, mixed, last = factor_of(jnp.stack([variances[0], mixed, variances[1]]))
+            one = lateral / first
+            other = (distance - mixed * one) / last
         return [
             Component([one * sigma[0]]),
             Component([other * sigma[1]]),

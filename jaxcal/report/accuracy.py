@@ -45,8 +45,8 @@ from jaxcal.model.image_points import distance, mean_of_squares
 from jaxcal.report.contradictions import contradictions
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Float
-from jaxcal.runtime.arrays import real_array
-from jaxcal.runtime.trees import map_arrays
+from jaxcal.runtime.arrays import map_arrays
+from jaxcal.runtime.given_values import real_array
 from jaxcal.solvers.closed_form.calibrate import calibrate_closed_form
 
 GOOD_MM = 0.5

@@ -13,7 +13,8 @@ from jaxcal.data.recording import Images, Recording
 from jaxcal.model.unknowns import EXTRA
 from jaxcal.result.calibration import Calibration
 from jaxcal.solvers.closed_form.calibrate import calibrate_closed_form
-from jaxcal.solvers.closed_form.certificate import Certificate, certify
+from jaxcal.solvers.closed_form.certificate import certify
+from jaxcal.solvers.closed_form.reduced_objective import Certificate
 
 
 def certificate_record(result: Calibration, recording: Recording) -> dict[str, Any]:

@@ -27,7 +27,7 @@ from jaxcal.report.summary import recording_of
 from jaxcal.report.svg import bar_length
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Float
-from jaxcal.runtime.arrays import real_array
+from jaxcal.runtime.given_values import real_array
 
 COLUMN_MM, PAGE_MM = 88.0, 180.0
 BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"

@@ -9,9 +9,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from jaxcal.diagnostics.uncertainty import TUNED
+from jaxcal.diagnostics.warnings import WEAK_MM
 from jaxcal.report.paragraphs import listed
 from jaxcal.report.resampled import resampled_sentences
+from jaxcal.solvers.plan import TUNED
 
 FEW_IMAGES = 20
 _MOST_MOVED_SHARE = 0.3
@@ -104,6 +105,13 @@ def where(record: dict[str, Any]) -> list[str]:
         f"In {_place(named['middle'])} it is {_mm(named['middle']['tre_mm'])}; at worst, in "
         f"{_place(worst)}, {_mm(worst['tre_mm'])}."
     ]
+    flat = tre["region"]["radius_mm"] is None
+    if flat and (record["observability"]["weakest_sd_mm"] or 0.0) > WEAK_MM:
+        left, right, near, far = map(round, tre["region"]["lateral_mm"] + tre["region"]["depth_mm"])
+        lines.append(
+            f"This is the part of the image where targets were seen, lateral {left} to {right}, "
+            f"depth {near} to {far} mm; elsewhere the error may be larger."
+        )
     for point in tre["points"]:
         if point["name"] == "asked for":
             low, high = point["interval_95_mm"]

@@ -17,8 +17,7 @@ from jaxcal.model.unknowns import TABLE, Blocks, in_image
 from jaxcal.result.saved import check_target
 from jaxcal.result.transform import AppliedPoints, ImageTransform, SaveFormat
 from jaxcal.runtime.array_types import AnyArray, Bool, Float, Int
-from jaxcal.runtime.arrays import array_module, is_traced
-from jaxcal.runtime.trees import array_tree, map_arrays, static
+from jaxcal.runtime.arrays import array_module, array_tree, is_traced, map_arrays, static
 from jaxcal.solvers.convergence import Convergence
 
 if TYPE_CHECKING:

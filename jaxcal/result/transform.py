@@ -30,8 +30,7 @@ from jaxcal.io.readable import naming
 from jaxcal.model.image_points import point_jacobian
 from jaxcal.model.unknowns import TABLE, tangent_names
 from jaxcal.runtime.array_types import Float
-from jaxcal.runtime.arrays import real_array
-from jaxcal.runtime.given_values import check_flag
+from jaxcal.runtime.given_values import check_flag, real_array
 
 SaveFormat = Literal["json", "plus", "slicer", "itk", "ros", "tusrec", "numpy"]
 

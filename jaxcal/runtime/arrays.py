@@ -1,18 +1,32 @@
-"""Numpy for values, jax.numpy inside somebody's jit, vmap or grad."""
+"""Arrays, numpy's or JAX's, and trees of them, without importing JAX.
+
+Code for both computes with numpy, and with jax.numpy inside somebody's jit, vmap or grad
+(:func:`array_module`).
+
+A tree is a frozen dataclass of arrays that JAX sees through (a pytree). The classes are registered
+when JAX is imported (:mod:`jaxcal.runtime.when_jax`), so problems and answers that were made before
+that are trees as well. An array with an axis of images is found by its annotation, where every
+class of jaxcal names this axis ``n``.
+"""
 
 from __future__ import annotations
 
+import dataclasses
+import re
 import sys
 from collections.abc import Callable
-from functools import wraps
-from typing import Any, ParamSpec, TypeVar
+from functools import cache, partial
+from typing import Any, TypeVar, dataclass_transform
 
 import numpy as np
 
-from jaxcal import InputError
+from jaxcal.runtime.when_jax import when_jax_is_imported
 
-P = ParamSpec("P")
 T = TypeVar("T")
+
+_STATIC = "static"
+
+_SHAPE = re.compile(r"""\[[^\[\]]*["']([^"']*)["']\]""")
 
 
 def is_traced(*values: object) -> bool:
@@ -22,41 +36,6 @@ def is_traced(*values: object) -> bool:
     if jax is None:
         return False
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
-
-
-def real_array(value: Any, name: str) -> np.ndarray:
-    """A caller's numbers as a float64 array of their own.
-
-    Raises:
-        InputError: what numpy would convert with a loss (complex numbers, masked entries), with a
-            guess (texts, truth values) or not at all.
-    """
-    if np.ma.is_masked(value):
-        raise InputError(f"{name} must not hold masked entries: leave those rows out (mask=)")
-    try:
-        given = np.asarray(value)
-        # bfloat16 and its like are of numpy's kind V.
-        other = given.dtype.kind == "V" and np.can_cast(given.dtype, np.float64)
-        if given.dtype.kind in "iufO" or other:
-            return np.array(given, np.float64)
-    except (TypeError, ValueError, OverflowError):
-        pass
-    raise InputError(f"{name} must be an array of real numbers")
-
-
-def is_number(value: Any) -> bool:
-    """Whether a caller's value is one finite real number, not a text, truth value or array."""
-    try:
-        number = real_array(value, "it")
-    except InputError:
-        return False
-    return number.ndim == 0 and bool(np.isfinite(number))
-
-
-def finite_or_none(value: Any) -> float | None:
-    """A number for JSON, which knows neither NaN nor infinity."""
-    number = float(value)
-    return number if np.isfinite(number) else None
 
 
 def array_module(*values: object) -> Any:
@@ -73,16 +52,121 @@ def like(before: Any, values: np.ndarray) -> Any:
     return jnp.asarray(values, before.dtype)
 
 
-def traceable(function: Callable[P, T]) -> Callable[P, T]:
-    """Decorate a user of :func:`array_module`, which then runs traced in JAX's standard modes."""
+def static(*, default: Any = dataclasses.MISSING) -> Any:
+    """A field of an array tree that is no array: part of the tree's structure, and hashable."""
+    if default is dataclasses.MISSING:
+        return dataclasses.field(metadata={_STATIC: True})
+    return dataclasses.field(default=default, metadata={_STATIC: True})
 
-    @wraps(function)
-    def in_standard_modes(*args: P.args, **kwargs: P.kwargs) -> T:
-        if not is_traced(args, kwargs):
-            return function(*args, **kwargs)
-        from jaxcal.runtime.precision import own_modes
 
-        with own_modes(bits_too=False):
-            return function(*args, **kwargs)
+@dataclass_transform(frozen_default=True, eq_default=False, field_specifiers=(static,))
+def array_tree(kind: type[T]) -> type[T]:
+    """Decorate a class: a frozen dataclass, and a pytree of its fields but for :func:`static` ones.
 
-    return in_standard_modes
+    Instances compare by identity, as arrays have no single truth value.
+    """
+    kind = dataclasses.dataclass(frozen=True, eq=False)(kind)
+    when_jax_is_imported(partial(_register, kind))
+    return kind
+
+
+def assembled(kind: type[T], values: dict[str, Any]) -> T:
+    """An object of a dataclass with these fields, without its constructor.
+
+    A constructor's annotations say what callers may pass; a tree may hold anything that JAX puts
+    into it (tracers, shapes, None).
+    """
+    made = object.__new__(kind)
+    for name, value in values.items():
+        object.__setattr__(made, name, value)
+    return made
+
+
+def map_arrays(function: Callable[[Any], Any], tree: T) -> T:
+    """The tree with a function applied to every array; like ``jax.tree.map``, without JAX.
+
+    Args:
+        function: of one array.
+        tree: of :func:`array_tree` classes, arrays and None.
+    """
+    if tree is None:
+        return tree
+    if not dataclasses.is_dataclass(tree) or isinstance(tree, type):
+        return function(tree)
+    changed = {
+        field.name: value if _STATIC in field.metadata else map_arrays(function, value)
+        for field in dataclasses.fields(tree)
+        for value in [getattr(tree, field.name)]
+    }
+    return assembled(type(tree), changed)
+
+
+def each_image(tree: Any, change: Callable[[Any, int], Any]) -> Any:
+    """The tree with ``change`` applied to every array that has an axis of images."""
+    changed: dict[str, Any] = {}
+    for field in dataclasses.fields(tree):
+        value = getattr(tree, field.name)
+        axis = _axis_of_images(str(field.type))
+        if dataclasses.is_dataclass(value):
+            value = each_image(value, change)
+        elif value is not None and axis is not None:
+            value = change(value, axis)
+        changed[field.name] = value
+    return assembled(type(tree), changed)
+
+
+def first_images(result: T, images: int) -> T:
+    """A result for the first images only.
+
+    Args:
+        result: a :class:`jaxcal.Calibration` in numpy arrays, or what it holds.
+        images: how many there were before padding.
+    """
+
+    def first(values: Any, axis: int) -> Any:
+        rows: list[slice] = [slice(None)] * values.ndim
+        rows[axis] = slice(0, images)
+        return values[tuple(rows)]
+
+    return each_image(result, first)
+
+
+@cache
+def _axis_of_images(annotation: str) -> int | None:
+    """Counted from the last axis, since leading ones are a batch's; None where there is none."""
+    shape = _SHAPE.search(annotation)
+    names = shape[1].split() if shape else []
+    return names.index("n") - len(names) if "n" in names else None
+
+
+def finite_or_none(value: Any) -> float | None:
+    """A number for JSON, which knows neither NaN nor infinity."""
+    number = float(value)
+    return number if np.isfinite(number) else None
+
+
+def _register(kind: type) -> None:
+    from jax.tree_util import GetAttrKey, register_pytree_with_keys
+
+    fields = dataclasses.fields(kind)
+    names = tuple(field.name for field in fields if _STATIC not in field.metadata)
+    others = tuple(field.name for field in fields if _STATIC in field.metadata)
+    keys = tuple(GetAttrKey(name) for name in names)
+
+    def parts(tree: Any) -> tuple[tuple, tuple]:
+        held = vars(tree)
+        return tuple(held[name] for name in names), tuple(held[name] for name in others)
+
+    def parts_with_keys(tree: Any) -> tuple[tuple, tuple]:
+        arrays, rest = parts(tree)
+        return tuple(zip(keys, arrays, strict=True)), rest
+
+    def whole(rest: tuple, arrays: Any) -> Any:
+        made = object.__new__(kind)
+        # Not setattr: the dataclass is frozen, and trees are taken apart often.
+        held = vars(made)
+        held.update(zip(names, arrays, strict=True))
+        held.update(zip(others, rest, strict=True))
+        return made
+
+    register_pytree_with_keys(kind, parts_with_keys, whole, parts)

@@ -13,6 +13,9 @@ through, and the sources of jaxcal. Who may write such files is the subject of
 Trees of arrays are described as JSON (:func:`describe`), so that neither pickles nor a trace are
 needed to put a result together. Programs that call functions outside XLA (LAPACK, callbacks) are
 compiled for this process only: the addresses mean nothing to another process.
+
+A few programs serve any number of images: callers pad their arrays to the size of a
+:func:`bucket` and cut the result. Padded images are masked, and no answer depends on them.
 """
 
 from __future__ import annotations
@@ -41,10 +44,13 @@ import numpy as np
 from jaxlib import xla_client
 
 from jaxcal.runtime import compiler, program_cache
-from jaxcal.runtime.trees import assembled
+from jaxcal.runtime.arrays import assembled
 
 LOADED = 32
 """Most programs kept in this process; the least recently used is dropped."""
+
+SMALLEST_BUCKET = 8
+"""Images of the smallest bucket."""
 
 TRACED_THROUGH = ("jax", "jaxlib", "equinox", "optimistix", "numpy")
 """Packages whose versions change what is compiled."""
@@ -109,6 +115,15 @@ class _Program:
         arrays = jax.device_put(leaves, self.device)
         pieces = self.executable.execute_sharded(arrays).disassemble_into_single_device_arrays()
         return rebuild(self.result, hold(jax.block_until_ready([shards[0] for shards in pieces])))
+
+
+def bucket(count: int) -> int:
+    """The size that so many images or problems are padded to: 8, 12, 16, 24, 32, 48, 64, 96, ..."""
+    size = SMALLEST_BUCKET
+    while size < count:
+        # Powers of two, and 1.5 times each of them.
+        size = size * 3 // 2 if size & (size - 1) == 0 else size * 4 // 3
+    return size
 
 
 def in_numpy(arrays: list[jax.Array]) -> list[np.ndarray]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from jaxcal import InputError
@@ -10,6 +12,35 @@ from jaxcal.runtime.messages import shown
 LARGEST_SEED = 2**63 - 1
 _KEY_DATA = ((2,), (4,))
 """Shapes of an old-style key, by JAX's generators."""
+
+
+def real_array(value: Any, name: str) -> np.ndarray:
+    """A caller's numbers as a float64 array of their own.
+
+    Raises:
+        InputError: what numpy would convert with a loss (complex numbers, masked entries), with a
+            guess (texts, truth values) or not at all.
+    """
+    if np.ma.is_masked(value):
+        raise InputError(f"{name} must not hold masked entries: leave those rows out (mask=)")
+    try:
+        given = np.asarray(value)
+        # bfloat16 and its like are of numpy's kind V.
+        other = given.dtype.kind == "V" and np.can_cast(given.dtype, np.float64)
+        if given.dtype.kind in "iufO" or other:
+            return np.array(given, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        pass
+    raise InputError(f"{name} must be an array of real numbers")
+
+
+def is_number(value: Any) -> bool:
+    """Whether a caller's value is one finite real number, not a text, truth value or array."""
+    try:
+        number = real_array(value, "it")
+    except InputError:
+        return False
+    return number.ndim == 0 and bool(np.isfinite(number))
 
 
 def whole_number(name: str, value: object, least: int, most: int) -> int:

@@ -28,7 +28,7 @@ from typing import Any, ParamSpec, TypeVar
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.runtime.trees import map_arrays
+from jaxcal.runtime.arrays import is_traced, map_arrays
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -133,6 +133,19 @@ def in_standard_promotion(function: Callable[P, T]) -> Callable[P, T]:
             return function(*args, **kwargs)
 
     return rule
+
+
+def traceable(function: Callable[P, T]) -> Callable[P, T]:
+    """Decorate a user of ``array_module``, which then runs traced in JAX's standard modes."""
+
+    @wraps(function)
+    def in_standard_modes(*args: P.args, **kwargs: P.kwargs) -> T:
+        if not is_traced(args, kwargs):
+            return function(*args, **kwargs)
+        with own_modes(bits_too=False):
+            return function(*args, **kwargs)
+
+    return in_standard_modes
 
 
 def require_float64(name: str) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from jaxcal.runtime.array_types import AnyArray, Bool, Float, Int
-from jaxcal.runtime.trees import array_tree
+from jaxcal.runtime.arrays import array_tree
 
 
 @array_tree

@@ -33,8 +33,8 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxcal import InputError
 from jaxcal.runtime.array_types import AnyArray
-from jaxcal.runtime.arrays import is_traced, real_array
-from jaxcal.runtime.given_values import whole_number
+from jaxcal.runtime.arrays import is_traced
+from jaxcal.runtime.given_values import real_array, whole_number
 from jaxcal.solvers.levenberg_marquardt import (
     IDLE,
     LARGEST_DAMPING,

@@ -15,7 +15,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxcal.data.problem import Problem
-from jaxcal.data.sound import WATER_M_S
 from jaxcal.model.batch import ImagePlanes, Iterate
 from jaxcal.model.distributions import OffsetLaw
 from jaxcal.model.observations import (
@@ -36,7 +35,7 @@ from jaxcal.solvers.alternating import Alternation, alternate, bounded
 from jaxcal.solvers.auto import average_over_laws
 from jaxcal.solvers.convergence import Convergence
 from jaxcal.solvers.gradient_descent import pairwise_gradient
-from jaxcal.solvers.levenberg_marquardt import Descent, minimise
+from jaxcal.solvers.levenberg_marquardt import Stopped, minimise
 from jaxcal.solvers.other import Fit, minimise_with, self_tuned_with
 from jaxcal.solvers.plan import DEFAULT_MAX_ELEVATION_MM, Given, Options, SolvePlan
 from jaxcal.solvers.reml import SelfTuned, on_floor, self_tuned
@@ -130,7 +129,7 @@ def observe(
     sigma = jnp.broadcast_to(sigma[:, None], (len(held), images.lanes))
     medium = None
     if given.medium_sd is not None and any(name in plan.blocks for name in MEDIUM):
-        speed = nominal_sound_speed(problems)
+        speed = problems.nominal_sound_speed
         # A delay in s is a distance in mm at the nominal speed.
         sd = jnp.stack([given.medium_sd[0] / speed, given.medium_sd[1] * speed * 1e3])
         medium = MediumPrior(sd, plan.blocks)
@@ -146,13 +145,6 @@ def observe(
     if shape is not None:
         return OwnCovariances(sigma, shape, sigma[1] / sigma[0]), medium
     return Points(sigma), medium
-
-
-def nominal_sound_speed(problem: Problem) -> Float[Array, "*batch"]:
-    """The speed by which times of flight became distances, m/s; water's where unknown."""
-    if problem.sound_speed is None:
-        return jnp.full(problem.batch_shape, WATER_M_S, problem.mask.dtype)
-    return problem.sound_speed
 
 
 def run(
@@ -198,7 +190,7 @@ def _descended(
     medium: MediumPrior | None,
     images: ImagePlanes,
     plan: SolvePlan,
-) -> Alternation | Descent | Fit | SelfTuned:
+) -> Stopped:
     """Where the plan's method stops."""
     options, other, start = plan.options, plan.other_solver, begun.place
     limits = {"max_steps": options.max_iterations, "trace": options.trace}

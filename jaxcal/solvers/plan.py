@@ -17,10 +17,9 @@ from jaxcal import InputError
 from jaxcal.model.distributions import SHAPES, UNIFORM, Shape
 from jaxcal.model.unknowns import Blocks
 from jaxcal.runtime.array_types import AnyArray, Float
-from jaxcal.runtime.arrays import is_traced, real_array
-from jaxcal.runtime.given_values import check_flag, whole_number
+from jaxcal.runtime.arrays import array_tree, is_traced
+from jaxcal.runtime.given_values import check_flag, real_array, whole_number
 from jaxcal.runtime.messages import shown
-from jaxcal.runtime.trees import array_tree
 from jaxcal.solvers.names import Method, SolverName
 
 if TYPE_CHECKING:
@@ -33,6 +32,9 @@ Prior = Literal["none", "gaussian", "bounded"]
 
 LAWS: dict[str, tuple[Shape, ...]] = {"auto": SHAPES, "uniform": UNIFORM}
 """The priors of the joint method that weigh laws of the offsets, each with its laws."""
+
+TUNED = ("gaussian", *LAWS)
+"""Priors with SDs of lateral position, range and offset."""
 
 DEFAULT_MAX_ELEVATION_MM = 1.0
 """The bound on the offsets if none is given; it is that of the paper."""

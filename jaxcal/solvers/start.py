@@ -41,7 +41,7 @@ from jaxcal.model.parameters import Parameters
 from jaxcal.model.unknowns import EXTRA, TABLE, Blocks
 from jaxcal.runtime.compiler import traced_once
 from jaxcal.solvers import dense
-from jaxcal.solvers.closed_form.start import Start
+from jaxcal.solvers.closed_form.single import Start
 from jaxcal.solvers.levenberg_marquardt import Descent, minimise
 
 LEAST_PIVOT = 1e-10

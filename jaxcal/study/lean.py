@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
-from jaxcal.calibration.options import Request, prepare
+from jaxcal.calibration.calibrate import Request, prepare
 from jaxcal.calibration.pipeline import solve_problems
 from jaxcal.data.geometry import chord_angle
 from jaxcal.data.problem import Problem

@@ -32,13 +32,14 @@ from jaxcal.data.segmentation.deviations import fit_deviations, halves
 from jaxcal.data.segmentation.time_of_flight import fit_in_plane
 from jaxcal.model import unrolled
 from jaxcal.runtime import executables
-from jaxcal.runtime.arrays import is_number, is_traced
+from jaxcal.runtime.arrays import is_traced
 from jaxcal.runtime.compiler import ONE_PROBLEM, computed_once
 from jaxcal.runtime.given_values import (
     LARGEST_SEED,
     check_flag,
     check_key,
     check_made,
+    is_number,
     whole_number,
 )
 from jaxcal.runtime.messages import shown

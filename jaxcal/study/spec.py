@@ -60,7 +60,7 @@ from typing import Any
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.calibration.options import ALTERNATION, Request, check_alternation, check_request
+from jaxcal.calibration.calibrate import ALTERNATION, Request, check_alternation, check_request
 from jaxcal.data.probe import LinearProbe
 from jaxcal.io.readable import naming
 from jaxcal.io.toml import load_toml, parse_toml

@@ -31,11 +31,10 @@ from jaxcal.data.segmentation.time_of_flight import (
     fit_out_of_plane,
     shortest,
 )
-from jaxcal.runtime import buckets, executables
+from jaxcal.runtime import executables
 from jaxcal.runtime.array_types import AnyArray
-from jaxcal.runtime.arrays import is_number
 from jaxcal.runtime.compiler import ONE_PROBLEM, batch_wishes, fast_to_run
-from jaxcal.runtime.given_values import check_flag, whole_number
+from jaxcal.runtime.given_values import check_flag, is_number, whole_number
 from jaxcal.runtime.messages import shown
 from jaxcal.runtime.precision import in_own_modes
 
@@ -157,20 +156,7 @@ def segment(
     """
     images = images_of(data, "jaxcal.segment")
     probe = data.probe if probe is None and isinstance(data, Recording) else probe
-    for name, value, names in (("method", method, Method), ("scale", scale, Scale)):
-        if not (isinstance(value, str) and value in get_args(names)):
-            raise InputError(f"{name} must be {' or '.join(get_args(names))}, not {shown(value)}")
-    check_flag("robust", robust)
-    check_flag("interpolate", interpolate)
-    if interpolate and method != "shortest":
-        raise InputError("interpolate needs the method shortest")
-    if scale != "frame" and method != "least-squares":
-        raise InputError("scale needs the method least-squares")
-    floor = _FEWEST_LINES[method]
-    if minimum_lines is not None:
-        floor = max(floor, whole_number("minimum_lines", minimum_lines, 1, MOST_ELEMENTS))
-    elif method == "least-squares":
-        floor = MINIMUM_LINES
+    floor = _fewest_lines(method, robust, scale, interpolate, minimum_lines)
     if minimum_amplitude is not None and not is_number(minimum_amplitude):
         raise InputError(f"minimum_amplitude must be one number, not {shown(minimum_amplitude)}")
     times = images.measurements if images.kind == "time_of_flight" else images.time_of_flight
@@ -242,6 +228,24 @@ def segment(
         out_of_plane=out_of_plane,
         warnings=_warnings(used, failed, missing, rejected, probe.elements),
     )
+
+
+def _fewest_lines(
+    method: Method, robust: bool, scale: Scale, interpolate: bool, asked: int | None
+) -> int:
+    """How many answers a frame needs; refuses options that contradict each other."""
+    for name, value, names in (("method", method, Method), ("scale", scale, Scale)):
+        if not (isinstance(value, str) and value in get_args(names)):
+            raise InputError(f"{name} must be {' or '.join(get_args(names))}, not {shown(value)}")
+    check_flag("robust", robust)
+    check_flag("interpolate", interpolate)
+    if interpolate and method != "shortest":
+        raise InputError("interpolate needs the method shortest")
+    if scale != "frame" and method != "least-squares":
+        raise InputError("scale needs the method least-squares")
+    if asked is None:
+        return MINIMUM_LINES if method == "least-squares" else _FEWEST_LINES[method]
+    return max(_FEWEST_LINES[method], whole_number("minimum_lines", asked, 1, MOST_ELEMENTS))
 
 
 def segment_recording(
@@ -404,7 +408,7 @@ def _fitted(
     if jax.default_backend() != "cpu":
         return compiled_fit(*how)(distances, positions)
     count, elements = distances.shape
-    padded = np.full((buckets.size(count), elements), np.nan)
+    padded = np.full((executables.bucket(count), elements), np.nan)
     padded[:count] = distances
     found = executables.run(
         "jaxcal.data.segmentation.segment:fit_frames",

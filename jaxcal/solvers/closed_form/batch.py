@@ -8,8 +8,8 @@ matrix Q = C'C, a vector b = -C'g and the multipliers of its constraints:
 
 Newton's method on the dual starts at the multipliers of the orthonormal pair nearest to Q^-1 b. A
 step is taken if M stays positive definite and the constraints are better met; otherwise it is cut.
-The duality gap of :mod:`jaxcal.solvers.closed_form.certificate` is computed for every problem, and
-only that decides whether an answer is called certified.
+The gap of the bound (:mod:`jaxcal.solvers.closed_form.reduced_objective`) is computed for every
+problem, and only that decides whether an answer is called certified.
 
 Derivatives follow from the implicit function theorem: with M = Q + sum_j l_j A_j and G = [A_j x],
 
@@ -37,10 +37,12 @@ from jaxcal.model import unrolled
 from jaxcal.model.unrolled import Matrix, Vector
 from jaxcal.runtime.arrays import is_traced
 from jaxcal.runtime.precision import in_standard_promotion, own_modes, require_float64, with_dtype
-from jaxcal.solvers.closed_form.certificate import NEARBY, SINGULAR, TOLERANCE
 from jaxcal.solvers.closed_form.reduced_objective import (
     CONSTRAINTS,
+    NEARBY,
     ROUNDING,
+    SINGULAR,
+    TOLERANCE,
     QuadraticConstraints,
     check_estimate,
 )
@@ -188,7 +190,7 @@ def solve_lanes(problems: Problem, estimate: tuple[str, ...]) -> ClosedForm:
     rounding = ROUNDING * jnp.finfo(x.dtype).eps
     certified = definite & (count >= MINIMUM_IMAGES)
     certified = certified & (gap <= TOLERANCE * objective + rounding * size)
-    # All that fits as well lies in a ball about the dual's minimiser (see ``certificate._alone``).
+    # All that fits as well lies in a ball about the dual's minimiser (as in ``certify_point``).
     ball = 4 * (gap + rounding * size)
     alone = ball <= NEARBY**2 * least * jnp.sum(x * x, axis=0)
     return ClosedForm(

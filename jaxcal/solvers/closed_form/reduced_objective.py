@@ -1,11 +1,11 @@
-"""Eq. 7 with the target and the image's origin eliminated: six unknowns instead of twelve.
+"""Eq. 7 with the target and the image's origin eliminated, and how much lower it could be.
 
 With r1 and r3 the lateral and axial columns of X's rotation, s1 and s3 the pixel scales and
 a1 = s1 r1, a3 = s3 r3, the residual of image i in Eq. 7 is linear in (a1, a3, t, c):
 
     e_i = R_i (u_i a1 + v_i a3 + t) + b_i - c.
 
-Linear least squares gives c and t for any a1, a3, and what remains of Eq. 7 is
+Linear least squares gives c and t for any a1, a3, and what remains of Eq. 7 has six unknowns:
 
     f(x) = |C x + g|^2 + rest,    x = (a1, a3), C upper triangular, 6 x 6.
 
@@ -13,8 +13,20 @@ Only the constraints on x depend on which scales are known (:data:`CONSTRAINTS`)
 r2 = r3 x r1 does not occur, so no reflection can arise. A known offset f of the transducer's face
 turns v_i a3 into v_i a3 + f r3. The added term is absorbed by t, so the form stays exact.
 
+*The bound.* The constraints are x' A_j x = e_j. Any multipliers l with M = C'C + sum_j l_j A_j
+positive definite bound f from below by the minimum over *all* x of f(x) + sum_j l_j (x' A_j x -
+e_j). For an x that satisfies the constraints
+
+    f(x) - bound = r' M^-1 r,    r = M x + C'g,
+
+a sum of squares without cancellation. It is zero where x is stationary and l are its multipliers.
+
 This module needs numpy only. It holds no solver: :mod:`jaxcal.solvers.closed_form.single` minimises
-f, :mod:`jaxcal.solvers.closed_form.certificate` bounds it from below.
+f, and the bound does not depend on how x was found.
+
+Sources: Boyd and Vandenberghe, "Convex Optimization", section 5.2 (weak duality); for certificates
+of calibration and registration Briales and Gonzalez-Jimenez, CVPR 2017, and Holmes, Duembgen and
+Barfoot, arXiv:2308.07275.
 """
 
 from __future__ import annotations
@@ -37,6 +49,18 @@ RANK_TOLERANCE = 1e-11
 
 ROUNDING = 64
 """Objectives are known up to this many roundings of the sum of squares of the data."""
+
+TOLERANCE = 1e-9
+"""A gap below this share of the objective counts as zero."""
+
+SHIFTS = (0.0, 1e-15, 1e-14, 1e-12, 1e-9, 1e-6, 1e-4, 1e-2)
+"""Shares by which multipliers are moved into the region where M is positive definite."""
+
+NEARBY = 0.01
+"""Answers that differ by less than this share of x are the same one."""
+
+SINGULAR = 1e-11
+"""M is called singular where its least eigenvalue is below this share of C'C's largest."""
 
 
 @dataclass(frozen=True)
@@ -268,3 +292,146 @@ def reduce(data: ImageData, constraints: QuadraticConstraints) -> ReducedObjecti
         mean=mean,
         constraints=constraints,
     )
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """What is proved about a solution of Eq. 7.
+
+    Attributes:
+        certified: no transform, target and free scales fit Eq. 7 better, up to one part in 1e9 and
+            to rounding.
+        gap_mm2: Eq. 7's minimum is at least ``objective_mm2 - gap_mm2``, mm^2; inf if no bound is
+            known.
+        objective_mm2: Eq. 7 at the answer, mm^2.
+        unique: it is proved that no other answer fits as well. False where other answers fit as
+            well, and where that is not known.
+    """
+
+    certified: bool
+    gap_mm2: float
+    objective_mm2: float
+    unique: bool
+
+
+def tolerance(reduced: ReducedObjective, objective: float) -> float:
+    """The gap below which an answer is called the minimum, mm^2."""
+    return TOLERANCE * objective + reduced.resolution
+
+
+def multipliers(reduced: ReducedObjective, x: Float[np.ndarray, 6]) -> Float[np.ndarray, " k"]:
+    """The multipliers that make x most nearly stationary."""
+    gradient = reduced.factor.T @ (reduced.factor @ x + reduced.shift)
+    columns = (reduced.constraints.matrices @ x).T
+    return -np.linalg.lstsq(columns, gradient, rcond=None)[0]
+
+
+def duality_gap(
+    reduced: ReducedObjective, x: Float[np.ndarray, 6], values: Float[np.ndarray, " k"]
+) -> float:
+    """f(x) less the bound that multipliers prove; inf where M is not positive definite.
+
+    Args:
+        reduced: f and its constraints.
+        x: satisfies the constraints.
+        values: multipliers.
+    """
+    added = np.tensordot(values, reduced.constraints.matrices, 1)
+    squared = reduced.factor.T @ reduced.factor
+    try:
+        lower = np.linalg.cholesky(squared + added)
+    except np.linalg.LinAlgError:
+        return np.inf
+    # C'(Cx + g) + Lx keeps the digits that (C'C + L) x + C'g would lose.
+    stationary = reduced.factor.T @ (reduced.factor @ x + reduced.shift) + added @ x
+    return float(np.sum(np.linalg.solve(lower, stationary) ** 2))
+
+
+def unconstrained_gap(reduced: ReducedObjective, x: Float[np.ndarray, 6]) -> float:
+    """f(x) less its minimum without any constraint; this bound holds for a singular C as well."""
+    left, values, _ = np.linalg.svd(reduced.factor)
+    within = left[:, values > SINGULAR * max(values[0], np.finfo(float).tiny)]
+    return float(np.sum((within.T @ (reduced.factor @ x + reduced.shift)) ** 2))
+
+
+def gap_of_multipliers(
+    reduced: ReducedObjective, x: Float[np.ndarray, 6], values: Float[np.ndarray, " k"]
+) -> float:
+    """The smallest gap proved by multipliers near the given ones, mm^2.
+
+    Where M is singular or a little indefinite, multipliers a little farther inside give a bound
+    that is a little lower, and still a proof.
+    """
+    constraints = reduced.constraints
+    size = float(np.linalg.norm(reduced.factor, 2)) ** 2
+    best = np.inf
+    for share in SHIFTS:
+        if constraints.free:
+            # M at l = 0 is C'C; on the way there, M is definite wherever both ends are.
+            moved = (1 - share) * values
+        else:
+            # |a1| and |a3| are known: if their two multipliers grow together, M grows, too.
+            moved = values + share * size * constraints.values
+        gap = duality_gap(reduced, x, moved)
+        if gap > best:
+            break
+        best = gap
+    return best
+
+
+def certify_point(
+    reduced: ReducedObjective,
+    x: Float[np.ndarray, 6],
+    *,
+    excess: float = 0.0,
+    values: Float[np.ndarray, " k"] | None = None,
+    gap: float = np.inf,
+) -> Certificate:
+    """The certificate of x, which satisfies the constraints, from multipliers.
+
+    Args:
+        reduced: f and its constraints.
+        x: (a1, a3).
+        excess: mm^2 by which the answer's t and c make Eq. 7 larger than f(x).
+        values: a solver's multipliers, which may be better than those that follow from x.
+        gap: f(x) less a bound that is known already, mm^2.
+    """
+    objective = float(reduced(x)) + excess
+    enough = tolerance(reduced, objective)
+    candidates = [multipliers(reduced, x)] + ([] if values is None else [values])
+    of_multipliers = np.inf
+    for each in candidates:
+        of_multipliers = min(of_multipliers, gap_of_multipliers(reduced, x, each))
+        if of_multipliers + excess <= enough:
+            break
+    unique = of_multipliers + excess <= enough and _alone(reduced, x, candidates[0], excess)
+    gap = min(gap, of_multipliers)
+    if gap + excess > enough:
+        gap = min(gap, unconstrained_gap(reduced, x))
+    return Certificate(
+        certified=bool(gap + excess <= enough),
+        gap_mm2=float(gap + excess),
+        objective_mm2=objective,
+        unique=bool(unique and reduced.origin_determined),
+    )
+
+
+def _alone(
+    reduced: ReducedObjective,
+    x: Float[np.ndarray, 6],
+    values: Float[np.ndarray, " k"],
+    excess: float,
+) -> bool:
+    """Whether everything that fits as well as x lies close to x.
+
+    Let M be positive definite, and x* the dual's minimiser. For every y that satisfies the
+    constraints, f(y) exceeds the bound by at least |y - x*|^2 times M's least eigenvalue. So x, and
+    everything that fits as well, lies in a ball about x*.
+    """
+    added = np.tensordot(values, reduced.constraints.matrices, 1)
+    squared = reduced.factor.T @ reduced.factor
+    least = np.linalg.eigvalsh(squared + added)[0]
+    if not least > SINGULAR * np.linalg.norm(squared, 2):
+        return False
+    above = duality_gap(reduced, x, values) + excess + reduced.resolution
+    return bool(4 * above <= (NEARBY * np.linalg.norm(x)) ** 2 * least)

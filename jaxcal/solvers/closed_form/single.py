@@ -18,8 +18,8 @@ is zero, x(l) satisfies the constraints and is the unique global minimum.
   best of 60 descents on the rotations is taken, and
   :mod:`jaxcal.solvers.closed_form.rotation_relaxation` is tried for a proof.
 
-The answer is polished by Newton's method on the rotation and certified by
-:mod:`jaxcal.solvers.closed_form.certificate`, which does not depend on how it was found.
+The answer is polished by Newton's method on the rotation and certified, which does not depend on
+how it was found.
 
 References: Boyd and Vandenberghe, "Convex Optimization", appendix B.1 (strong duality for one
 quadratic constraint); More, "Generalizations of the trust region problem", Optimization Methods and
@@ -29,27 +29,31 @@ Software 2, 1993 (the equality); Briales and Gonzalez-Jimenez, CVPR 2017.
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from jaxcal.data.poses import rotations_from_quaternions
-from jaxcal.runtime.array_types import Float
-from jaxcal.runtime.trees import array_tree
-from jaxcal.solvers.closed_form.certificate import Certificate, certify_point, tolerance
+from jaxcal.runtime.array_types import Bool, Float, HeldArray
+from jaxcal.runtime.arrays import array_tree, assembled
 from jaxcal.solvers.closed_form.reduced_objective import (
+    Certificate,
     ImageData,
     QuadraticConstraints,
     ReducedObjective,
+    certify_point,
     image_data,
     reduce,
+    tolerance,
 )
 from jaxcal.solvers.closed_form.rotation_relaxation import lower_bound
 
 if TYPE_CHECKING:
     from jaxcal.data.problem import Problem
     from jaxcal.data.recording import Images, Recording
+    from jaxcal.model.unknowns import Blocks
 
 Numbers = Any
 """A number, or for a batch an array of them."""
@@ -96,6 +100,28 @@ class ClosedForm:
     unique: Numbers
 
 
+@array_tree
+class Start:
+    """The start of methods that begin at the conventional fit: Eq. 7's minimum of one problem.
+
+    Attributes:
+        rotation: of X.
+        translation: of X, mm.
+        point: the target in the tracker's frame, mm.
+        scale: factors on the problem's [lateral, axial] spacing.
+        sound_speed: factor on the nominal one.
+        searched: the minimum is not proved to be the only one; descents from many rotations found
+            it.
+    """
+
+    rotation: Float[HeldArray, "*batch 3 3"]
+    translation: Float[HeldArray, "*batch 3"]
+    point: Float[HeldArray, "*batch 3"]
+    scale: Float[HeldArray, "*batch 2"]
+    sound_speed: Float[HeldArray, "*batch"]
+    searched: Bool[HeldArray, "*batch"]
+
+
 def solve_problem(
     problem: Problem | Recording | Images, estimate: tuple[str, ...] = ()
 ) -> ClosedForm:
@@ -104,6 +130,34 @@ def solve_problem(
     reduced = reduce(data, constraints)
     x, certificate = solve(reduced)
     return _assemble(x, certificate, reduced, data)
+
+
+def closed_form_start(problem: Problem, blocks: Blocks) -> Start:
+    """The start of a method, from the closed form of Eq. 7.
+
+    Args:
+        problem: one problem with concrete, finite values and at least 4 used images.
+        blocks: the free unknowns; those without a closed form begin at their nominal values.
+
+    Returns:
+        The start in the problem's own precision.
+    """
+    known = replace(problem, spacing_known=True, channels=None)
+    found = solve_problem(known, ("scale",) if "scale" in blocks else ())
+    scale = np.ones(2)
+    if found.scale_mm_per_px is not None:
+        scale = np.asarray(found.scale_mm_per_px) / np.asarray(problem.spacing)
+    parts = {
+        "rotation": found.image_to_probe[:3, :3],
+        "translation": found.image_to_probe[:3, 3],
+        "point": found.point_mm,
+        "scale": scale,
+        "sound_speed": np.asarray(found.sound_speed_factor),
+    }
+    dtype = np.asarray(problem.mask).dtype
+    parts = {name: np.asarray(value, dtype) for name, value in parts.items()}
+    parts["searched"] = np.asarray(not (found.certified and found.unique))
+    return assembled(Start, parts)
 
 
 def solve(reduced: ReducedObjective) -> tuple[Float[np.ndarray, 6], Certificate]:
