@@ -276,5 +276,5 @@ def _sentence(words: str, before: float, after: float, count: int) -> str:
     worse, better = np.sqrt(before / count), np.sqrt(after / count)
     return (
         f"it looks as if {words} (root mean square error {worse:.2g} mm as given, {better:.2g} mm "
-        "after that)"
+        "once corrected)"
     )

@@ -47,8 +47,8 @@ def misfits(result: Calibration) -> list[str]:
         tails, skewness, depth, _, _ = scores[:, k]
         if tails > MISFIT_SCORE:
             found.append(
-                f"the {name} have heavier tails than the noise model's (kurtosis "
-                f"{kurtosis[k]:.1f}, Gaussian 3)"
+                f"the {name} have heavier tails than assumed (kurtosis {kurtosis[k]:.1f}, "
+                "Gaussian 3)"
             )
         # Offsets may have edges of their own.
         if k < 2 and in_two_groups(tails, kurtosis[k]):
@@ -59,7 +59,7 @@ def misfits(result: Calibration) -> list[str]:
         if abs(skewness) > MISFIT_SCORE:
             found.append(f"the {name} are skewed to one side")
         if depth > MISFIT_SCORE:
-            found.append(f"the {name} grow with depth; the noise model assumes that they do not")
+            found.append(f"the {name} grow with depth, but are assumed not to")
         found += _in_time(name, scores[:, k], int(result.images_used))
     return found
 

@@ -322,11 +322,14 @@ def advice(record: dict[str, Any]) -> list[str]:
     if record["outliers"]:
         listed = ", ".join(map(str, record["outliers"][:10]))
         more = ", ..." if len(record["outliers"]) > 10 else ""
-        images = f"images {listed}{more} (counted from 0)"
+        one = len(record["outliers"]) == 1
+        images = f"image{'s' * (not one)} {listed}{more} (counted from 0)"
+        them = "it" if one else "them"
         advice.append(
-            f"Check {images}, which were left out, and pick the target in them again."
+            f"Check {images}, which {'was' if one else 'were'} left out, and pick the target in "
+            f"{them} again."
             if record.get("robust")
-            else f"Check {images} and pick the target in them again, or calibrate with --robust, "
-            "which leaves them out."
+            else f"Check {images} and pick the target in {them} again, or calibrate with --robust, "
+            f"which leaves {them} out."
         )
     return advice
