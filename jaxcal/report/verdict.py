@@ -109,7 +109,7 @@ def where(record: dict[str, Any]) -> list[str]:
     if flat and (record["observability"]["weakest_sd_mm"] or 0.0) > WEAK_MM:
         left, right, near, far = map(round, tre["region"]["lateral_mm"] + tre["region"]["depth_mm"])
         lines.append(
-            f"This is for the part of the image where targets were seen (lateral {left} to {right}, "
+            f"This is for the part in which targets were seen (lateral {left} to {right}, "
             f"depth {near} to {far} mm); elsewhere the error may be larger."
         )
     for point in tre["points"]:
