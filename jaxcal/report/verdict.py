@@ -260,7 +260,7 @@ def certainty(record: dict[str, Any]) -> list[str]:
     """How certain the transform is, and on which assumptions this rests."""
     spread = spread_of_transform(record)
     if spread is None:
-        return ["How certain the transform is cannot be said from these images."]
+        return ["These images do not show how certain the transform is."]
     along = max(range(3), key=lambda axis: record["covariance"][axis][axis])
     about = max(range(3), key=lambda axis: record["covariance"][3 + axis][3 + axis])
     lines = [
