@@ -46,9 +46,9 @@ def calibrate_and_print(path: str, *lines: str) -> dict[str, Any]:
 def lines_of(path: str, outcome: Outcome, speed: float) -> list[str]:
     """How a robot's acquisition went, for a person."""
     lines = [
-        f"{outcome.images} images in {path}, {outcome.taken / outcome.seconds * 60:.1f} a minute "
-        f"of the bench's time ({outcome.seconds:.0f} s"
-        + (f", {outcome.seconds / speed:.0f} s on the wall)" if speed != 1.0 else ")")
+        f"{outcome.images} images in {path}, {outcome.taken / outcome.seconds * 60:.1f} per "
+        f"minute of bench time ({outcome.seconds:.0f} s"
+        + (f", {outcome.seconds / speed:.0f} s of real time)" if speed != 1.0 else ")")
     ]
     if outcome.given_up:
         rows = ", ".join(str(row + 1) for row in outcome.given_up)

@@ -331,7 +331,7 @@ def _print(found: Plan, record: dict[str, Any], figure: str | None) -> None:
         for wanted, count in record["images_to_tre_mm"].items()
     ]
     (near, far), (left, right) = (record["region"][k] for k in ("depth_mm", "lateral_mm"))
-    before = "" if not there else f" after the {there} that there are"
+    before = "" if not there else f" added to the {there} existing ones"
     these = "this image" if len(found) == 1 else f"these {len(found)} images"
     print_page(
         table,

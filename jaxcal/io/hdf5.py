@@ -103,7 +103,7 @@ def load(path: str | os.PathLike[str]) -> Recording:
     check_readable(path)
     if not h5py.is_hdf5(path):
         raise FormatError(
-            f"{os.fspath(path)}: is not an HDF5 file (jaxcal import makes one of other programs' "
+            f"{os.fspath(path)}: is not an HDF5 file (jaxcal import makes one from other programs' "
             "files)"
         )
     return _read(path, os.fspath(path))
@@ -178,7 +178,7 @@ def _check_header(root: Node) -> None:
     if found != FORMAT:
         what = "it has no attribute format" if found is None else f"its format is {quoted(found)}"
         raise FormatError(
-            f"is not a recording: {what}, {FORMAT!r} is needed (jaxcal import makes one of other "
+            f"is not a recording: {what}, {FORMAT!r} is needed (jaxcal import makes one from other "
             "programs' files)"
         )
     version = number(root, "version")

@@ -544,7 +544,7 @@ def test_the_rate_is_that_of_this_run(tmp_path):
             file[f"placement/{name}"] = np.full(60, np.nan)
     outcome = Outcome(60, taken=10, given_up=(), sha256="", seconds=100.0)
     assert lines_of(str(path), outcome, 1.0) == [
-        f"60 images in {path}, 6.0 a minute of the bench's time (100 s)"
+        f"60 images in {path}, 6.0 per minute of bench time (100 s)"
     ]
 
 
