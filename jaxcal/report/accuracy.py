@@ -314,7 +314,7 @@ def settle(record: dict[str, Any]) -> None:
         point["tre_mm"] = factor * point["stated_mm"]
         point["interval_95_mm"] = [factor * end for end in point["stated_interval_mm"]]
     if usable:
-        # Both ends count: few images tell hardly how large the error is.
+        # With few images the error itself is uncertain, so the upper end of its interval counts.
         error = max(tre["rms_mm"], tre["interval_95_mm"][1] / WIDEST)
         record["verdict"] = (
             "good" if error <= GOOD_MM else "fair" if error <= FAIR_MM else "uncertain"
