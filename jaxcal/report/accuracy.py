@@ -76,6 +76,7 @@ def accuracy_record(
     problem = answer.problem
     if problem is None:
         answer = answer.with_problem(Problem.from_recording(recording)).numpy()
+    recording = as_solved(recording, answer)
     region = region_of(answer, recording)
     grid = region.grid()[:, [0, 2]]
     weight = mean_of_squares(image_jacobian(answer, grid))
@@ -94,6 +95,19 @@ def accuracy_record(
         "influence": influence,
         "comparison": _comparison(answer, recording, found, grid),
     }
+
+
+def as_solved(recording: Recording, answer: Calibration) -> Recording:
+    """The recording with the images of the solve, in which every pose counts once."""
+    images, problem = recording.calibration, answer.problem
+    if problem is None:
+        return recording
+    mask, measured = np.asarray(problem.mask) > 0, images.measurements
+    if images.kind != "time_of_flight":
+        measured = np.asarray(problem.measurements, float)
+    poses = np.asarray(problem.poses, float)
+    images = replace(images, poses=poses, measurements=measured, mask=mask)
+    return replace(recording, calibration=images)
 
 
 def region_of(answer: Calibration, recording: Recording) -> Region:
