@@ -266,7 +266,9 @@ def _comparison(
         further["scale"] = list(scale[:, None])
     alone = map_arrays(lambda leaf: np.asarray(leaf, float)[None], problem)
     unknowns = Unknowns(x[None, :3, :3], x[None, :3, 3], point[None], further)
-    sigma = np.asarray(answer.sigma, float)
+    sigma, tracker = np.asarray(answer.sigma, float), answer.linearisation.tracker_sd
+    if tracker is not None:
+        sigma = np.hypot(sigma, tracker)
     if not np.isfinite(sigma).all():
         return None
     fit = conventional_fit(unknowns, alone, answer.blocks, used, sigma)
