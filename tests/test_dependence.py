@@ -25,6 +25,7 @@ from jaxcal.calibration.serial_correlation import CHANCE, believed_correlation
 from jaxcal.data.problem import Channels
 from jaxcal.data.recording import make_images
 from jaxcal.report.accuracy import GOOD_MM
+from jaxcal.report.record import calibration_record
 
 
 @pytest.fixture(scope="module")
@@ -182,6 +183,16 @@ def test_held_probes_are_covered_and_never_good(frames):
     assert images == 0
     assert len(inside) > 20
     assert np.mean(inside) > 0.93
+
+
+def test_a_record_is_of_the_images_of_the_solve(frames):
+    """Not of all frames: what the command line says is what is said in Python."""
+    made = frames.held(25, 4, np.random.default_rng(5))
+    recording = jaxcal.Recording(make_images(made.poses, made.points))
+    result = jaxcal.calibrate(recording, "conventional")
+    told, own = calibration_record(result, recording), result.record()
+    for name in ("reconstruction_precision_mm", "tre", "influence"):
+        assert told[name] == own[name]
 
 
 def test_correlated_errors_widen_the_covariance(frames):

@@ -51,7 +51,8 @@ class CrossValidation(eqx.Module):
         precision: norm of the SD of ``cloud`` (Eq. 8 for images that were not used), mm.
         rms: root mean square length of ``cloud``, mm.
         log_density: (n,) log predictive density of each image's three errors under the Gaussian
-            SDs of the calibration that held the image out; 0 where not used.
+            SDs (the tracker's included) of the calibration that held the image out; 0 where not
+            used.
         moved: (n, 6) [v, omega] by which leaving the image (its fold) out moves X, right
             perturbation, mm and rad.
         influence: (n,) length of ``moved`` in SDs of X: sqrt(moved' Cov^-1 moved / 6); NaN without
@@ -159,7 +160,10 @@ def _compared(
     points = _corners(problem, result)
     whole = jnp.asarray(result.image_to_probe)
     image_moved = _apart(_with_scale(held, result), whole, points) * mask
-    density = -0.5 * jnp.sum((errors / held.sigma) ** 2 + jnp.log(2 * jnp.pi * held.sigma**2), 1)
+    sd, tracker = held.sigma, held.linearisation.tracker_sd
+    if tracker is not None:
+        sd = jnp.hypot(sd, tracker[:, None])
+    density = -0.5 * jnp.sum((errors / sd) ** 2 + jnp.log(2 * jnp.pi * sd**2), 1)
     return CrossValidation(
         residual=errors,
         cloud=cloud,

@@ -82,6 +82,7 @@ def accuracy_record(
     problem = answer.problem
     if problem is None:
         answer = answer.with_problem(Problem.from_recording(recording)).numpy()
+    recording = as_solved(recording, answer)
     region = region_of(answer, recording)
     grid = region.grid()[:, [0, 2]]
     weight = mean_of_squares(image_jacobian(answer, grid))
@@ -100,6 +101,19 @@ def accuracy_record(
         "influence": influence,
         "comparison": _comparison(answer, recording, found, grid),
     }
+
+
+def as_solved(recording: Recording, answer: Calibration) -> Recording:
+    """The recording with the images of the solve, in which every pose counts once."""
+    images, problem = recording.calibration, answer.problem
+    if problem is None:
+        return recording
+    mask, measured = np.asarray(problem.mask) > 0, images.measurements
+    if images.kind != "time_of_flight":
+        measured = np.asarray(problem.measurements, float)
+    poses = np.asarray(problem.poses, float)
+    images = replace(images, poses=poses, measurements=measured, mask=mask)
+    return replace(recording, calibration=images)
 
 
 def region_of(answer: Calibration, recording: Recording) -> Region:
@@ -258,7 +272,9 @@ def _comparison(
         further["scale"] = list(scale[:, None])
     alone = map_arrays(lambda leaf: np.asarray(leaf, float)[None], problem)
     unknowns = Unknowns(x[None, :3, :3], x[None, :3, 3], point[None], further)
-    sigma = np.asarray(answer.sigma, float)
+    sigma, tracker = np.asarray(answer.sigma, float), answer.linearisation.tracker_sd
+    if tracker is not None:
+        sigma = np.hypot(sigma, tracker)
     if not np.isfinite(sigma).all():
         return None
     fit = conventional_fit(unknowns, alone, answer.blocks, used, sigma)

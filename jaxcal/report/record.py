@@ -16,7 +16,7 @@ from jaxcal.diagnostics.metrics import reconstruction_precision
 from jaxcal.diagnostics.misfits import noise_model
 from jaxcal.diagnostics.outliers import outlier_reasons, outliers, suspects
 from jaxcal.model.unknowns import in_image, tangent_names
-from jaxcal.report.accuracy import accuracy_record, settle
+from jaxcal.report.accuracy import accuracy_record, as_solved, settle
 from jaxcal.report.certified import certificate_record
 from jaxcal.result.calibration import Calibration
 from jaxcal.result.saved import FORMAT, VERSION
@@ -207,7 +207,7 @@ def _precision(
     images = check_test_images(recording, test)
     name = "calibration" if images is None else "test"
     if images is None:
-        images = recording.calibration
+        images = as_solved(recording, result).calibration
     if images.mask.sum() < 2:
         return None, name
     value = reconstruction_precision(
