@@ -28,7 +28,6 @@ from jaxcal.solvers import dense
 from jaxcal.solvers.levenberg_marquardt import (
     Descent,
     Rounding,
-    Stopped,
     empty_trace,
     gradient_cosine,
     minimise,
@@ -41,18 +40,28 @@ TURNS = (0.0, 1.0, -1.0)
 """Starts, in units of the rotation that moves a target at mean range by the mean bound."""
 
 
-class Alternation(Stopped):
-    """Where the alternation stopped; ``cost`` and ``cosine`` are the bounded joint problem's.
-
-    It is settled if X had stopped moving, not at the round limit.
+class Alternation(eqx.Module):
+    """Where the alternation stopped.
 
     Attributes:
+        place: X and c.
+        cost: sum of squared distances, mm^2.
+        cosine: gradient cosine of the bounded joint problem there.
+        iterations: rounds.
+        settled: it stopped because X had stopped moving, not at the round limit.
         rotation_change: X's rotation in the last round, rad.
         translation_change: X's translation in the last round, mm.
+        trace: cost after each of the first rounds, NaN beyond the last; None: not kept.
     """
 
+    place: Iterate
+    cost: Float[Array, " lanes"]
+    cosine: Float[Array, " lanes"]
+    iterations: Int[Array, " lanes"]
+    settled: Bool[Array, " lanes"]
     rotation_change: Float[Array, " lanes"]
     translation_change: Float[Array, " lanes"]
+    trace: Float[Array, "trace lanes"] | None
 
 
 class _Rounds(eqx.Module):

@@ -126,51 +126,46 @@ def judge_step(
     )
 
 
-class Stopped(eqx.Module):
-    """Where a method stopped, for every method alike; lanes last.
+class Descent(eqx.Module):
+    """The state of every lane.
 
     Attributes:
-        place: X, c and the further unknowns; of the search for other problems, any unknowns.
-        cost: sum of squared (whitened) residuals there.
-        cosine: gradient cosine there.
-        iterations: the method's passes, steps or rounds.
-        settled: converged by the method's own rule, as far as rounding allows.
-        trace: best cost after each of the first iterations; NaN beyond the last, or where it is not
-            known; None: not kept.
+        place: the best so far.
+        cost: sum of squared (whitened) residuals at ``place``.
+        cosine: gradient cosine at ``place``; after a last step that was not evaluated, its bound.
+        candidate: the place to evaluate next.
+        retry: ``candidate`` is ``place`` again, with more damping or without second derivatives.
+        exact_used: 1 where the step to the candidate came from an exact curvature.
+        exact_next: 1 where the candidate's curvature is to be exact.
+        damping: Marquardt's lambda.
+        predicted: predicted decrease of half the cost by the step to the candidate.
+        idle: steps in a row without a gain.
+        iterations: number of evaluations.
+        settled: converged, as far as rounding allows.
+        active: the lane goes on.
+        trace: best cost after each of the first evaluations; NaN beyond the last; None: not kept.
     """
 
     place: Any
     cost: Float[Array, " lanes"]
     cosine: Float[Array, " lanes"]
-    iterations: Int[Array, " lanes"]
-    settled: Bool[Array, " lanes"]
-    trace: Float[Array, "trace lanes"] | None
-
-
-class Search(Stopped):
-    """The state of every lane of a search that judges its steps; ``place`` is the best so far.
-
-    Attributes:
-        candidate: the place to evaluate next.
-        retry: ``candidate`` is ``place`` again, with more damping or without second derivatives.
-        exact_used: 1 where the step to the candidate came from exact second derivatives.
-        damping: Marquardt's lambda.
-        predicted: predicted decrease of half the cost by the step to the candidate.
-        idle: steps in a row without a gain.
-        active: the lane goes on.
-    """
-
     candidate: Any
     retry: Bool[Array, " lanes"]
     exact_used: Float[Array, " lanes"]
+    exact_next: Float[Array, " lanes"]
     damping: Float[Array, " lanes"]
     predicted: Float[Array, " lanes"]
     idle: Int[Array, " lanes"]
+    iterations: Int[Array, " lanes"]
+    settled: Bool[Array, " lanes"]
     active: Bool[Array, " lanes"]
+    trace: Float[Array, "trace lanes"] | None = None
 
-    @staticmethod
-    def first(start: Any, number: Float[Array, " lanes"], damping: float, trace: int) -> dict:
-        """The parts of a state before the first evaluation, by name.
+    @classmethod
+    def before(
+        cls, start: Any, number: Float[Array, " lanes"], damping: float, *, trace: int = 0
+    ) -> Descent:
+        """The state before the first evaluation.
 
         Args:
             start: the first candidate.
@@ -179,38 +174,22 @@ class Search(Stopped):
             trace: how many values of the cost to keep.
         """
         no, count = jnp.zeros(number.shape, bool), jnp.zeros(number.shape, jnp.int32)
-        return {
-            "place": start,
-            "cost": number + jnp.inf,
-            "cosine": number + jnp.inf,
-            "iterations": count,
-            "settled": no,
-            "trace": empty_trace(trace, number),
-            "candidate": start,
-            "retry": ~no,
-            "exact_used": number,
-            "damping": number + damping,
-            "predicted": number,
-            "idle": count,
-            "active": ~no,
-        }
-
-
-class Descent(Search):
-    """The state of every lane; ``cosine`` after a last step that was not evaluated is its bound.
-
-    Attributes:
-        exact_next: 1 where the candidate's curvature is to be exact.
-    """
-
-    exact_next: Float[Array, " lanes"]
-
-    @classmethod
-    def before(
-        cls, start: Any, number: Float[Array, " lanes"], damping: float, *, trace: int = 0
-    ) -> Descent:
-        """The state before the first evaluation; arguments as for :meth:`Search.first`."""
-        return cls(**cls.first(start, number, damping, trace), exact_next=number)
+        return cls(
+            place=start,
+            cost=number + jnp.inf,
+            cosine=number + jnp.inf,
+            candidate=start,
+            retry=~no,
+            exact_used=number,
+            exact_next=number,
+            damping=number + damping,
+            predicted=number,
+            idle=count,
+            iterations=count,
+            settled=no,
+            active=~no,
+            trace=empty_trace(trace, number),
+        )
 
 
 def empty_trace(length: int, number: Float[Array, " lanes"]) -> Float[Array, "trace lanes"] | None:

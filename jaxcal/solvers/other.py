@@ -11,13 +11,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxcal.model.batch import ImagePlanes, Iterate, choose, targets
 from jaxcal.model.observations import Further, MediumPrior, Observation
 from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
 from jaxcal.runtime.compiler import traced_once
-from jaxcal.solvers.levenberg_marquardt import Rounding, Stopped, empty_trace, gradient_cosine
+from jaxcal.solvers.levenberg_marquardt import Rounding, empty_trace, gradient_cosine
 from jaxcal.solvers.normal_equations import accumulate, component_sums, weight_of
 from jaxcal.solvers.plan import Options
 from jaxcal.solvers.reml import update_at, with_floor
@@ -29,14 +29,26 @@ MOST_UPDATES = 60
 """Most updates of the SDs."""
 
 
-class Fit(Stopped):
-    """Where the solver stopped, as it says; it does not tell the values of a trace.
+class Fit(eqx.Module):
+    """Where the solver stopped; lanes last.
 
     Attributes:
+        place: X, c and the further unknowns.
+        cost: sum of squared (whitened) residuals.
+        cosine: gradient cosine there.
+        settled: the solver says that it converged.
+        iterations: the solver's steps.
         updated: SDs after the last update, mm; those given where none are tuned.
+        trace: NaN, since the solver does not tell its values; None: not kept.
     """
 
+    place: Iterate
+    cost: Float[Array, " lanes"]
+    cosine: Float[Array, " lanes"]
+    settled: Bool[Array, " lanes"]
+    iterations: Int[Array, " lanes"]
     updated: Float[Array, "k lanes"]
+    trace: Float[Array, "trace lanes"] | None
 
     @classmethod
     def of(
@@ -53,13 +65,13 @@ class Fit(Stopped):
         normal = accumulate(place, observation, images, None, medium)
         rounding = Rounding.of(start, observation, images)
         return cls(
-            place=place,
-            cost=normal.cost,
-            cosine=gradient_cosine(normal, rounding.vanished),
-            iterations=jnp.asarray(found.stats["num_steps"], jnp.int32)[None],
-            settled=(found.result == optx.RESULTS.successful)[None],
-            trace=empty_trace(trace, normal.cost),
-            updated=observation.sigma,
+            place,
+            normal.cost,
+            gradient_cosine(normal, rounding.vanished),
+            (found.result == optx.RESULTS.successful)[None],
+            jnp.asarray(found.stats["num_steps"], jnp.int32)[None],
+            observation.sigma,
+            empty_trace(trace, normal.cost),
         )
 
 

@@ -36,7 +36,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxcal.model.batch import ImagePlanes, Iterate, barrier, choose
 from jaxcal.model.observations import MediumPrior, Observation
@@ -49,9 +49,9 @@ from jaxcal.solvers.levenberg_marquardt import (
     MORE,
     Judged,
     Rounding,
-    Search,
     damped_step,
     default_tolerance,
+    empty_trace,
     gradient_cosine,
     judge_step,
     reach,
@@ -108,40 +108,80 @@ def helmert(
     return jnp.sqrt(jnp.maximum(squares, 0.0) / freedom)
 
 
-class SelfTuned(Search):
+class SelfTuned(eqx.Module):
     """The state of every lane; at the end, its answer.
 
     Attributes:
+        place: X, c and the further unknowns.
         sigma: the SDs, mm.
         updated: the SDs after one more update at ``place``.
+        cost: sum of squared (weighted) residuals.
         change: largest relative change of the SDs by that update.
+        cosine: gradient cosine.
+        candidate: the place to look at next.
         proposed: the SDs at ``candidate``.
         units: the SDs that set the units of the residuals in the last pass.
+        retry: ``candidate`` is ``place`` again, with more damping.
         weighed: the SDs for which the step to the candidate was computed.
         half: half the cost before that step, with ``weighed``.
+        predicted: predicted decrease of ``half`` by that step.
+        exact_used: 1 where the step came from exact second derivatives.
+        damping: Marquardt's lambda.
+        idle: steps in a row without a gain.
+        iterations: passes.
+        settled: converged, as far as rounding allows.
+        active: the lane goes on.
+        trace: best cost after each of the first passes; NaN beyond the last; None: not kept.
     """
 
+    place: Iterate
     sigma: Float[Array, "k lanes"]
     updated: Float[Array, "k lanes"]
+    cost: Float[Array, " lanes"]
     change: Float[Array, " lanes"]
+    cosine: Float[Array, " lanes"]
+    candidate: Iterate
     proposed: Float[Array, "k lanes"]
     units: Float[Array, "k lanes"]
+    retry: Bool[Array, " lanes"]
     weighed: Float[Array, "k lanes"]
     half: Float[Array, " lanes"]
+    predicted: Float[Array, " lanes"]
+    exact_used: Float[Array, " lanes"]
+    damping: Float[Array, " lanes"]
+    idle: Int[Array, " lanes"]
+    iterations: Int[Array, " lanes"]
+    settled: Bool[Array, " lanes"]
+    active: Bool[Array, " lanes"]
+    trace: Float[Array, "trace lanes"] | None
 
     @classmethod
     def before(cls, start: Iterate, held: Float[Array, "k lanes"], trace: int) -> SelfTuned:
         """The state before the first pass; infinite SDs leave out exact second derivatives."""
-        number, sigma = jnp.zeros_like(start.point[0]), jnp.zeros_like(held) + jnp.inf
+        number = jnp.zeros_like(start.point[0])
+        no, count = jnp.zeros(number.shape, bool), jnp.zeros(number.shape, jnp.int32)
+        sigma = jnp.zeros_like(held) + jnp.inf
         return cls(
-            **cls.first(start, number, 1e-6, trace),
+            place=start,
             sigma=sigma,
             updated=sigma,
+            cost=number,
             change=number,
+            cosine=number,
+            candidate=start,
             proposed=sigma,
             units=sigma,
+            retry=~no,
             weighed=sigma,
             half=number,
+            predicted=number,
+            exact_used=number,
+            damping=number + 1e-6,
+            idle=count,
+            iterations=count,
+            settled=no,
+            active=~no,
+            trace=empty_trace(trace, number),
         )
 
 
