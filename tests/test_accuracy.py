@@ -262,7 +262,7 @@ def test_the_part_of_the_image_is_named_where_the_rest_is_hardly_known():
         said = "\n".join(jaxcal.calibrate(data, "conventional").verdict())
         assert ("elsewhere the error may be larger" in said) == told
         if told:
-            least, most = said.split(" mm; elsewhere")[0].split("depth ")[-1].split(" to ")
+            least, most = said.split(" mm); elsewhere")[0].split("depth ")[-1].split(" to ")
             assert depth[strip].min() - 5 < int(least) < int(most) < depth[strip].max() + 5
 
 

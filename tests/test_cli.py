@@ -278,7 +278,7 @@ def test_calibrate_speaks_to_a_person(simulated, capfd, monkeypatch, tmp_path):
     assert out.endswith("\n\nreport: cal.html\n")
     assert (tmp_path / "cal.html").read_text().startswith("<!DOCTYPE html>")
     assert "image_plane_to_probe (mm)" in out
-    assert "the target stays within" in out
+    assert "the images put the target" in out
     assert max(map(len, out.splitlines())) <= 100
 
 

@@ -461,4 +461,10 @@ def test_one_more_image_is_not_called_images(count, words):
         "poses": [{"words": "tilt"}], "tre_now_mm": 2.0, "tre_then_mm": 1.0,
         "images_to_half": count,
     }  # fmt: skip
-    assert words in next_poses_sentences({"next_poses": found})[-1]
+    told = next_poses_sentences({"next_poses": found, "tre": {"rms_mm": 2.0}})
+    assert words in told[-1]
+    assert "from 2.00 to 1.00 mm" in told[0]
+    # Where no error is stated, none is promised.
+    told = next_poses_sentences({"next_poses": found, "tre": {"rms_mm": None}})
+    assert told[-1] == "- tilt"
+    assert "2.00" not in told[0]

@@ -73,15 +73,18 @@ def next_poses_sentences(record: dict[str, Any]) -> list[str]:
     if found is None:
         return []
     now, then = found["tre_now_mm"], found["tre_then_mm"]
+    tre = record.get("tre") or {}
+    stated = tre.get("rms_mm") is not None
     # More images do not help against an error that the noise model leaves out.
-    beside = bool((record.get("tre") or {}).get("contradictions"))
+    beside = bool(tre.get("contradictions"))
     error = "error by the noise model alone" if beside else "predicted error"
+    gain = f" that reduce the {error} from {now:.2f} to {then:.2f} mm" if stated else ""
     lines = listed(
-        f"What would help most: {len(found['poses'])} images that reduce the {error} from "
-        f"{now:.2f} to {then:.2f} mm. From the middle orientation, with the marker to your right",
+        f"What would help most: {len(found['poses'])} images{gain}. From the middle orientation, "
+        "with the marker to your right",
         [pose["words"] for pose in found["poses"]],
     )
-    if found["images_to_half"] is not None:
+    if stated and found["images_to_half"] is not None:
         more = found["images_to_half"]
         images = "image" if more == 1 else "images"
         stays = "; what contradicts the noise model may remain" if beside else ""

@@ -299,26 +299,7 @@ def advice(record: dict[str, Any]) -> list[str]:
     advice: list[str] = []
     if record.get("wrong_frames"):
         return advice
-    if status == "failed":
-        advice.append(
-            "Check that poses and images belong together, that poses are probe -> tracker, and "
-            "that lengths are in mm."
-        )
-    elif status == "unobservable":
-        advice.append(_addition(record))
-    elif status == "max_iterations":
-        advice.append(
-            "Leave out images in which the target was picked wrongly (they have the largest "
-            "residuals), or add images; then calibrate again."
-        )
-    else:
-        if few or record["verdict"] == "uncertain":
-            advice.append(_addition(record))
-    if status == "converged" and record["method"] == "conventional" and _out_of_plane(record):
-        advice.append(
-            "Most of the error is out of the image plane, where the conventional method assumes "
-            "none: try --method joint."
-        )
+    # First what may be wrong with the images that there are.
     if record["outliers"]:
         listed = ", ".join(map(str, record["outliers"][:10]))
         more = ", ..." if len(record["outliers"]) > 10 else ""
@@ -331,5 +312,24 @@ def advice(record: dict[str, Any]) -> list[str]:
             if record.get("robust")
             else f"Check {images} and pick the target in {them} again, or calibrate with --robust, "
             f"which leaves {them} out."
+        )
+    if status == "failed":
+        advice.append(
+            "Check that poses and images belong together, that poses are probe -> tracker, and "
+            "that lengths are in mm."
+        )
+    elif status == "unobservable":
+        advice.append(_addition(record))
+    elif status == "max_iterations":
+        advice.append(
+            "Leave out images in which the target was picked wrongly (they have the largest "
+            "residuals), or add images; then calibrate again."
+        )
+    elif few or record["verdict"] == "uncertain":
+        advice.append(_addition(record))
+    if status == "converged" and record["method"] == "conventional" and _out_of_plane(record):
+        advice.append(
+            "Most of the error is out of the image plane, where the conventional method assumes "
+            "none: try --method joint."
         )
     return advice
