@@ -289,7 +289,7 @@ def test_trackers_exports(tmp_path):
     assert len(read_tracker(tmp_path / "t.csv")) == 2
     for text in (MOTIVE, OLD_NDI):
         (tmp_path / "t.csv").write_text(text.replace(",", ";"))
-        with pytest.raises(FormatError, match="import the file that the tracker's program wrote"):
+        with pytest.raises(FormatError, match="import the original file of the tracker's program"):
             import_files([tmp_path / "t.csv"])
     (tmp_path / "t.csv").write_text(NDI.replace("0.5973400", "0.59x"))
     with pytest.raises(FormatError, match=r"line 2: column 7 is not a number: '0\.59x'"):
