@@ -97,10 +97,9 @@ claim(
 OURS, FAR, FITTED = "calibrate_batch", "20 degrees, 20 mm off", "conventional fit"
 
 
-def _over(peer: str, start: str = FAR) -> float:
+def _over(peer: str, start: str = FAR, *, of: str = "solver_peers", which: str = "median") -> float:
     """How many times as long as ours a peer takes."""
-    over = "calibrate_batch_over_it_median"
-    return only("solver_peers", over, solver=peer, start=start, images="50")
+    return only(of, f"calibrate_batch_over_it_{which}", solver=peer, start=start, images="50")
 
 
 claim(
@@ -118,6 +117,14 @@ claim(
         _over("scipy lm"),
         _over("optimistix LM, vmapped"),
     ),
+)
+claim(
+    SPEED,
+    "Ceres (DENSE_SCHUR) took {:.1f} times as long (single rounds: {:.1f} to {:.1f})",
+    lambda: [
+        _over("Ceres DENSE_SCHUR, 1e-9", of="solver_peers_again", which=which)
+        for which in ("median", "min", "max")
+    ],
 )
 claim(
     SPEED,
