@@ -188,7 +188,8 @@ def test_held_probes_are_covered_and_never_good(frames):
 def test_a_record_is_of_the_images_of_the_solve(frames):
     """Not of all frames: what the command line says is what is said in Python."""
     made = frames.held(25, 4, np.random.default_rng(5))
-    recording = jaxcal.Recording(make_images(made.poses, made.points))
+    probe = jaxcal.LinearProbe()
+    recording = jaxcal.Recording(make_images(made.poses, made.points), probe=probe)
     result = jaxcal.calibrate(recording, "conventional")
     told, own = calibration_record(result, recording), result.record()
     for name in ("reconstruction_precision_mm", "tre", "influence"):

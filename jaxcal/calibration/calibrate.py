@@ -10,9 +10,10 @@ one pure function of arrays (:mod:`jaxcal.calibration.pipeline`).
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, get_args
+from functools import wraps
+from typing import Any, ParamSpec, get_args
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from jaxcal import InputError
 from jaxcal.calibration.conventional import closed_form_answer
 from jaxcal.calibration.dependence import independent
 from jaxcal.calibration.serial_correlation import widened
-from jaxcal.data.problem import Problem, as_batch, check_shapes, check_values, converting
+from jaxcal.data.problem import Problem, as_batch, as_problem, check_shapes, check_values
 from jaxcal.data.recording import MINIMUM_IMAGES, Recording
 from jaxcal.model.distributions import Shape
 from jaxcal.model.unknowns import EXTRA, MEDIUM, RIGID
@@ -67,6 +68,8 @@ ALTERNATION = ("tolerance_rad", "tolerance_mm", "max_rounds", "inner_steps")
 LARGEST_CHUNK = 2**31 - 1
 """Most lanes that can be asked for side by side."""
 
+P = ParamSpec("P")
+
 
 @dataclass(frozen=True)
 class Request:
@@ -85,7 +88,23 @@ class Request:
     robust: bool = False
 
 
-@converting
+def _taking_recordings(function: Callable[P, Calibration]) -> Callable[P, Calibration]:
+    """Decorate :func:`calibrate`: it takes recordings as well, and the answer knows their probe.
+
+    Placed outside ``in_own_modes``: to segment times of flight imports JAX, and what imports JAX
+    within would run in the caller's modes.
+    """
+
+    @wraps(function)
+    def taking(problem: Problem | Recording, *args: Any, **kwargs: Any) -> Calibration:
+        found = function(as_problem(problem, "jaxcal.calibrate"), *args, **kwargs)  # pyright: ignore[reportCallIssue]
+        probe = problem.probe if isinstance(problem, Recording) else None
+        return found if probe is None else replace(found, probe=probe)
+
+    return taking  # pyright: ignore[reportReturnType]
+
+
+@_taking_recordings
 @in_own_modes
 def calibrate(
     problem: Problem | Recording,

@@ -9,10 +9,8 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable
 from dataclasses import replace
-from functools import wraps
-from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -28,8 +26,6 @@ from jaxcal.runtime.precision import importing_jax, in_own_modes
 if TYPE_CHECKING:
     from jax.typing import DTypeLike
 
-P = ParamSpec("P")
-T = TypeVar("T")
 
 _HOW = (
     "jaxcal.Problem.from_arrays(poses, measurements) makes one of arrays, jaxcal.load(path) reads "
@@ -350,25 +346,6 @@ def as_batch(value: Any, name: str) -> Problem:
 
 def _are_problems(values: Any) -> bool:
     return all(isinstance(each, Problem | Recording | Images) for each in values)
-
-
-def converting(function: Callable[P, T]) -> Callable[P, T]:
-    """Decorate a public function whose first argument is a problem: it takes recordings as well.
-
-    Placed outside :func:`jaxcal.runtime.precision.in_own_modes`: to segment times of flight imports
-    JAX, and what imports JAX within would run in the caller's modes.
-    """
-
-    @wraps(function)
-    def converted(*args: P.args, **kwargs: P.kwargs) -> T:
-        name = f"jaxcal.{function.__name__}"
-        if args:
-            return function(*(as_problem(args[0], name), *args[1:]), **kwargs)  # pyright: ignore[reportCallIssue]
-        if "problem" in kwargs:
-            kwargs["problem"] = as_problem(kwargs["problem"], name)
-        return function(*args, **kwargs)
-
-    return converted
 
 
 def check_shapes(problem: Problem) -> None:

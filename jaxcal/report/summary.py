@@ -46,7 +46,7 @@ def recording_of(calibration: Calibration) -> Recording:
         spacing_mm=spacing,
         face_offset_mm=float(np.asarray(problem.face_offset)),
     )
-    return Recording(images, source="memory")
+    return Recording(images, probe=calibration.probe, source="memory")
 
 
 def record_of(

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxcal import CalibrationError, InputError
+from jaxcal.data.probe import Probe
 from jaxcal.data.problem import Problem
 from jaxcal.model.distributions import OffsetLaw
 from jaxcal.model.unknowns import TABLE, Blocks, in_image
@@ -121,6 +122,8 @@ class Calibration:
         blocks: the free unknowns (static).
         robust: images that do not fit the rest were left out (static).
         notes: what was done to the data before the solve, in words (static; one problem).
+        probe: the transducer, if a recording named it; its face is part of the region that errors
+            are stated for (static; one problem).
     """
 
     image_to_probe: Float[AnyArray, "*batch 4 4"]
@@ -146,6 +149,7 @@ class Calibration:
     blocks: Blocks = static()
     robust: bool = static(default=False)
     notes: tuple[str, ...] = static(default=())
+    probe: Probe | None = static(default=None)
 
     @property
     def converged(self) -> Bool[AnyArray, "*batch"]:
