@@ -1,9 +1,9 @@
 """What solves a problem or a batch by the engine: a kept program on a CPU, else one of JAX's own.
 
 On a CPU, machine code is kept between processes (:mod:`jaxcal.runtime.executables`) in sizes that
-serve many problems; a program that is found there is neither
-imported, traced nor compiled. On other devices, inside somebody's jit, vmap or grad, and with a
-solver of the caller's own, JAX compiles :mod:`jaxcal.calibration.programs` as it compiles anything.
+serve many problems; a program that is found there is neither imported, traced nor compiled. On
+other devices, inside somebody's jit, vmap or grad, and with a solver of the caller's own, JAX
+compiles :mod:`jaxcal.calibration.programs` as it compiles anything.
 """
 
 from __future__ import annotations

@@ -56,8 +56,8 @@ FAIR_MM = 1.5
 WIDEST = 3.0
 """Largest upper end of the interval for either word, as a multiple of the word's largest error.
 
-Of seven images or more it is at most 3.3 times the error itself; of four, with the conventional
-method, 29 times: such a number is no answer, however small it is.
+Of few images, whose errors tell little about their own size, the interval is many times as wide as
+the error: such a number is no answer, however small it is.
 """
 
 _ACROSS = 15
