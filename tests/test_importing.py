@@ -231,7 +231,17 @@ def test_times_that_go_back(tmp_path):
     (tmp_path / "t.csv").write_text(
         "\n".join([*lines[:3], lines[3][lines[3].index(",") :], *lines[4:]])
     )
-    assert len(import_files([tmp_path / "t.csv"], ImportOptions(ignore_time=True)).recording) == 6
+    recording, notes, _ = import_files([tmp_path / "t.csv"], ImportOptions(ignore_time=True))
+    assert (len(recording), recording.calibration.time) == (6, None)
+    assert notes == ["time stamps are missing or cannot be read: not kept"]
+
+
+def test_ignoring_bad_times_keeps_good_ones(tmp_path):
+    """Those of a table like those of a sequence."""
+    (tmp_path / "t.csv").write_text("\n".join(table(["time", *NAMES], [np.arange(6.0), *COLUMNS])))
+    recording, notes, _ = import_files([tmp_path / "t.csv"], ImportOptions(ignore_time=True))
+    np.testing.assert_array_equal(recording.calibration.time, np.arange(6.0))
+    assert notes == []
 
 
 def test_times_in_another_unit_than_seconds(tmp_path):

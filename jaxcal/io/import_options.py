@@ -31,7 +31,7 @@ class ImportOptions:
             or ``cross``.
         region: (first column, first row, columns, rows) to look in, px.
         orientation: of the stored pixels of frames that are searched, where the file does not say.
-        ignore_time: time stamps that repeat or go back are no error, and are not kept.
+        ignore_time: time stamps that repeat, go back or are missing are no error: none are kept.
         poses: file with the poses of the frames: a table for a folder of images; a sequence, a
             tracker's export or a table with times for a sequence.
         lag_s: with ``poses``: an image stamped t shows what was at t - lag; ``auto``: estimated

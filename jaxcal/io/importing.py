@@ -87,7 +87,9 @@ def import_files(
             "with poses is needed"
         )
     table = read_rows(sources[0], options, ignore_time=options.ignore_time)
-    notes = table.notes + ["time stamps are not kept"] * options.ignore_time
+    notes = table.notes
+    if table.time is None and options.ignore_time:
+        notes = [*notes, "time stamps are missing or cannot be read: not kept"]
     if table.time is not None:
         time, said = _good_time(table.time, lambda row: f"{table.name}:{table.lines[row]}", options)
         table, notes = replace(table, time=time), notes + said

@@ -108,7 +108,7 @@ def read_pose_table(
         units: of u and v, where the header does not say; px by default.
         skip_invalid: leave out rows that a column ``valid`` or ``status`` marks as invalid, and
             rows with empty cells, NaN, Inf or a pose of zeros; otherwise they are errors.
-        ignore_time: do not read the times.
+        ignore_time: times that are missing or cannot be read are no errors: the table has none.
 
     Raises:
         FormatError: a file, a header or a row that cannot be read; file and line are named.
@@ -117,16 +117,20 @@ def read_pose_table(
     table = read_table(path)
     with naming(path):
         columns = _columns(table, quaternion)
-        if ignore_time:
-            columns = replace(columns, time=None)
         if quaternion is not None and columns.matrix is not None:
             raise FormatError("its poses are matrices: leave --quaternion out")
-        rows, skipped = _used_rows(table, columns, skip_invalid)
+        needed = replace(columns, time=None) if ignore_time else columns
+        rows, skipped = _used_rows(table, needed, skip_invalid)
         unit = _agreed(units, columns.point_unit)
         points = None if columns.point is None else table.numbers(columns.point, rows)
         if points is not None and unit != "px":
             points *= LENGTHS_MM[unit]
-        time, clock = _times(table, columns, rows)
+        try:
+            time, clock = _times(table, columns, rows)
+        except FormatError:
+            if not ignore_time:
+                raise
+            time, clock = None, None
         frame = None if columns.frame is None else _whole_numbers(table, columns.frame, rows)
         file = None
         if columns.file is not None:
