@@ -302,7 +302,7 @@ def test_trackers_exports(tmp_path):
         with pytest.raises(FormatError, match="import the original file of the tracker's program"):
             import_files([tmp_path / "t.csv"])
     (tmp_path / "t.csv").write_text(NDI.replace("0.5973400", "0.59x"))
-    with pytest.raises(FormatError, match=r"line 2: column 7 is not a number: '0\.59x'"):
+    with pytest.raises(FormatError, match=r":2: column 7 is not a number: '0\.59x'"):
         read_tracker(tmp_path / "t.csv")
 
 
@@ -440,10 +440,10 @@ def test_times_of_points_count_though_a_frame_has_none(tmp_path, sequence):
     np.testing.assert_allclose(images.measurements, PIXELS[[0, 1, 3, 5]])
     np.testing.assert_allclose(images.poses, POSES[[0, 1, 3, 5]], atol=1e-11)
     (tmp_path / "p.csv").write_text("\n".join(table(["time", "u", "v"], [moments, PIXELS])))
-    with pytest.raises(InputError, match=r"line 6: .*1 of 6 frames of .* have no time stamp"):
+    with pytest.raises(InputError, match=r"\.csv:6: .*1 of 6 frames of .* have no time stamp"):
         import_files([sequence, tmp_path / "p.csv"])
     sequence.write_bytes(re.sub(stamp.format("[135]"), "", content).encode("latin-1"))
-    with pytest.raises(InputError, match=r"line 3: .*3 of 6 frames of .* have no time stamp"):
+    with pytest.raises(InputError, match=r"\.csv:3: .*3 of 6 frames of .* have no time stamp"):
         import_files([sequence, tmp_path / "p.csv"])
     sequence.write_bytes(re.sub(stamp.format("[0-4]"), "", content).encode("latin-1"))
     with pytest.raises(

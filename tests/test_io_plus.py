@@ -177,7 +177,7 @@ def test_definitions_without_an_end_tag_get_one():
              OTHER.replace("StylusTip", "Probe").replace('"Stylus"', '"X"')],
             "Image to X (line 7), Probe to X (line 8); PLUS refuses a second path",
         ),
-        ([OLD.replace(' From="Image"', "")], "line 7: <Transform> has no From"),
+        ([OLD.replace(' From="Image"', "")], ":7: <Transform> has no From"),
     ],
 )  # fmt: skip
 def test_what_plus_refuses(inside, message, tmp_path):
@@ -203,7 +203,7 @@ BOMB = '<!DOCTYPE x [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a
         (b"<Other/>", "its root is 'Other'"),
         (
             configuration("<Transform From='A' To='B' Matrix='1 2 3'/>"),
-            "line 7: Matrix of <Transform> has 3 numbers, 16",
+            ":7: Matrix of <Transform> has 3 numbers, 16",
         ),
         (configuration(OLD.replace("1 0 0 0 0", "nan 0 0 0 0")), "<Transform> holds NaN"),
         (configuration(OLD.replace("1 0 0 0 0", "1 x 0 0 0")), "is not numbers"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -91,11 +92,17 @@ def one_line(error: Exception) -> str:
 
 @contextmanager
 def naming(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Put a file's name in front of the messages of errors that do not begin with it."""
+    """Put a file's name in front of the messages of errors that do not begin with it.
+
+    A line at their beginning goes to the name: ``line 6: ...`` becomes ``FILE:6: ...``.
+    """
     name = path_name(path)
     try:
         yield
     except InputError as error:
         text = str(error)
         named = text.startswith((f"{name}:", f"{name} with "))
-        raise type(error)(text if named else f"{name}: {text}") from None
+        if not named:
+            line = re.match(r"line (\d+): ", text)
+            text = f"{name}: {text}" if line is None else f"{name}:{line[1]}: {text[line.end() :]}"
+        raise type(error)(text) from None
