@@ -56,7 +56,10 @@ def test_notebooks_get_a_drawing_and_no_script(result):
 def test_batches_and_traces_print_without_a_verdict(recording):
     problem = jaxcal.Problem.from_recording(recording)
     batch = jaxcal.calibrate_batch([problem, recording], "conventional")
-    assert str(batch) == "Calibration of a batch of 2: 2 converged; batch[0] is the first of them"
+    assert str(batch) == (
+        "Calibration of a batch of 2: 2 converged. Frames and units are not checked here, but in "
+        "each calibration: batch[0] is the first"
+    )
     assert batch._repr_html_() is None
     one = jaxcal.calibrate(problem, "conventional")
     np.testing.assert_allclose(batch.image_to_probe[1], one.image_to_probe, atol=1e-9)

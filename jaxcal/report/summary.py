@@ -80,12 +80,18 @@ def text_of(calibration: Calibration, width: int = 100) -> str:
 
 
 def batch_text(calibration: Calibration) -> str:
-    """How many calibrations of a batch ended with each status, and how to see one of them."""
+    """How many calibrations of a batch ended with each status, and how to see one of them.
+
+    Wrong frames are not counted: looking for them takes milliseconds for each calibration.
+    """
     status = np.asarray(calibration.status)
     names, counts = np.unique(status, return_counts=True)
     told = ", ".join(f"{count} {name}" for name, count in zip(names, counts, strict=True))
     shape = " x ".join(map(str, status.shape))
-    return f"Calibration of a batch of {shape}: {told or 'empty'}; batch[0] is the first of them"
+    return (
+        f"Calibration of a batch of {shape}: {told or 'empty'}. Frames and units are not checked "
+        "here, but in each calibration: batch[0] is the first"
+    )
 
 
 def html_of(calibration: Calibration) -> str:
