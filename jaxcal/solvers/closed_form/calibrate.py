@@ -10,12 +10,16 @@ from jaxcal.runtime.arrays import is_traced
 from jaxcal.solvers.closed_form.single import ClosedForm, solve_problem
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from jaxcal.data.problem import Problem
     from jaxcal.data.recording import Images, Recording
 
 
 def calibrate_closed_form(
-    problem: Problem | Recording | Images, *, estimate: str | tuple[str, ...] = ()
+    problem: Problem | Recording | Images | Sequence[Problem | Recording | Images],
+    *,
+    estimate: str | tuple[str, ...] = (),
 ) -> ClosedForm:
     """Conventional calibration (Eq. 7) in closed form, with a certificate.
 
@@ -24,8 +28,8 @@ def calibrate_closed_form(
     :mod:`jaxcal.solvers.closed_form.batch`.
 
     Args:
-        problem: a problem or a batch of them, a recording, or one set of images; covariances and
-            bounds are not used, since Eq. 7 weighs all images equally.
+        problem: a problem or a batch of them, a recording, or one set of images; a list of them is
+            stacked. Covariances and bounds are not used, since Eq. 7 weighs all images equally.
         estimate: what is unknown beside X and the target: ``()``, ``("scale",)`` (both pixel
             scales), ``("common-scale",)`` (square pixels of unknown size) or
             ``("sound-speed",)``; one name may stand without its tuple.
@@ -39,8 +43,12 @@ def calibrate_closed_form(
     """
     if isinstance(estimate, str):
         estimate = (estimate,)
+    if isinstance(problem, list | tuple):
+        from jaxcal.data.problem import as_batch
+
+        problem = as_batch(problem, "jaxcal.calibrate_closed_form")
     if np.ndim(getattr(problem, "mask", ())) > 1 or is_traced(problem):
         from jaxcal.solvers.closed_form.batch import solve_batch
 
         return solve_batch(problem, tuple(estimate))  # pyright: ignore[reportArgumentType]
-    return solve_problem(problem, estimate)
+    return solve_problem(problem, estimate)  # pyright: ignore[reportArgumentType]
