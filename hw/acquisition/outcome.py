@@ -23,19 +23,17 @@ def calibrate_and_print(path: str, *lines: str) -> dict[str, Any]:
         The calibration's record (:func:`jaxcal.report.record.calibration_record`).
     """
     from jaxcal.calibration.calibrate import calibrate
-    from jaxcal.cli.common import Verbatim, print_page
-    from jaxcal.data.segmentation.segment import segment_recording
+    from jaxcal.cli.common import Verbatim, print_page, segmented
     from jaxcal.io.hdf5 import load
     from jaxcal.report.record import calibration_record
     from jaxcal.report.tables import calibration_table
     from jaxcal.report.verdict import verdict
 
-    recording = load(path)
-    if recording.calibration.kind == "time_of_flight":
-        recording, _ = segment_recording(recording)
+    recording, notes = segmented(load(path))
     images = recording.calibration
     scale = ("scale",) if images.kind == "pixel" and images.spacing_mm is None else ()
     record = calibration_record(calibrate(recording, estimate=scale), recording)
+    record["warnings"] += notes
     hint = " --estimate scale" if scale else ""
     again = f"jaxcal calibrate {shlex.quote(path)}{hint} --report report.html"
     last = (f"{path}: again, with a report:", Verbatim(f"  {again}"))

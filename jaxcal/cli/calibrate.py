@@ -22,6 +22,7 @@ from jaxcal.cli.common import (
     print_json,
     print_page,
     progress,
+    segmented,
     verdict_code,
 )
 from jaxcal.solvers.names import Data, Method, PriorName, SolverName
@@ -224,8 +225,8 @@ def calibrate(
     from jaxcal.report.write import prepare_folder, write_report
     from jaxcal.runtime.jax_cache import enable_compilation_cache
 
-    measured, notes = _segmented(load(recording))
-    test_data = None if test is None else _segmented(load(test))[0]
+    measured, notes = segmented(load(recording))
+    test_data = None if test is None else segmented(load(test))[0]
     check_test_images(measured, test_data)
     _check_pixels(measured, targets)
     enable_compilation_cache()
@@ -334,23 +335,6 @@ def _export(
         else:
             said += written(transform, path, format)
     return said
-
-
-def _segmented(recording: Recording) -> tuple[Recording, list[str]]:
-    """A recording with points in the place of times of flight, and what there is to say of them."""
-    test = recording.test
-    raw = recording.calibration.kind == "time_of_flight"
-    if not raw and (test is None or test.kind != "time_of_flight"):
-        return recording, []
-    if not raw:
-        raise InputError(
-            f"{recording.source}: the test images hold times of flight, but the calibration "
-            "images do not: segment them first"
-        )
-    from jaxcal.data.segmentation.segment import segment_recording
-
-    segmented, found = segment_recording(recording)
-    return segmented, list(found.warnings)
 
 
 def _solve(recording: Recording, request: Request, *, traced: bool) -> Calibration:

@@ -1,4 +1,4 @@
-"""What the commands share: numbers that are numbers, progress, JSON, exit codes."""
+"""What the commands share: numbers that are numbers, points, progress, JSON, exit codes."""
 
 from __future__ import annotations
 
@@ -18,8 +18,12 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from jaxcal import InputError
+
 if TYPE_CHECKING:
     from rich.console import RenderableType
+
+    from jaxcal.data.recording import Recording
 
 
 class ExitCode(enum.IntEnum):
@@ -160,6 +164,23 @@ def print_page(*parts: RenderableType) -> None:
                 page.print(*group)
     # Not straight from rich, which leaves the process when the pipe is closed early.
     click.echo(captured.get(), nl=False)
+
+
+def segmented(recording: Recording) -> tuple[Recording, list[str]]:
+    """A recording with points in the place of times of flight, and what there is to say of them."""
+    test = recording.test
+    raw = recording.calibration.kind == "time_of_flight"
+    if not raw and (test is None or test.kind != "time_of_flight"):
+        return recording, []
+    if not raw:
+        raise InputError(
+            f"{recording.source}: the test images hold times of flight, but the calibration "
+            "images do not: segment them first"
+        )
+    from jaxcal.data.segmentation.segment import segment_recording
+
+    points, found = segment_recording(recording)
+    return points, list(found.warnings)
 
 
 @contextmanager

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 from jaxcal import InputError
-from jaxcal.cli.calibrate import _segmented
 from jaxcal.cli.common import (
     NOT_NEGATIVE,
     POSITIVE,
@@ -19,6 +18,7 @@ from jaxcal.cli.common import (
     print_page,
     progress,
     seed_option,
+    segmented,
 )
 from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
 from jaxcal.study.laws import OFFSET_LAWS, OffsetLaw
@@ -258,7 +258,7 @@ def _from_recording(
             f"--estimate {NOT_PLANNED}: no plan is made with it, since its predictions would be "
             "wrong: leave it out here"
         )
-    measured, _ = _segmented(load(path))
+    measured, _ = segmented(load(path))
     with progress("calibrating"):
         result = calibrate(measured, estimate=names)
     if result.status == "failed":
