@@ -122,64 +122,85 @@ def compute_on_workers(
     Raises:
         CalibrationError: a chunk could not be computed, or killed its workers.
     """
-    waiting: queue.SimpleQueue[Chunk] = queue.SimpleQueue()
-    for chunk in chunks:
-        waiting.put(chunk)
-    # Bounded, so that a slow disk does not fill this process's memory.
-    done: queue.Queue[Any] = queue.Queue(maxsize=len(groups))
-    ending = threading.Event()
-    workers: dict[int, Worker] = {}
+    crew = _Crew(spec, chunks, groups)
+    crew.start()
+    try:
+        for _ in chunks:
+            yield crew.next_done()
+    finally:
+        crew.end()
 
-    def hand_over(result: Any) -> None:
-        while not ending.is_set():
-            with contextlib.suppress(queue.Full):
-                done.put(result, timeout=_POLL_S)
-                return
 
-    def drive(place: int) -> None:
+class _Crew:
+    """A thread for each worker process: it takes chunks that wait, and hands over what is done."""
+
+    def __init__(self, spec: Study, chunks: list[Chunk], groups: list[set[int]]) -> None:
+        self._spec, self._groups = spec, groups
+        self._waiting: queue.SimpleQueue[Chunk] = queue.SimpleQueue()
+        for chunk in chunks:
+            self._waiting.put(chunk)
+        # Bounded, so that a slow disk does not fill this process's memory.
+        self._done: queue.Queue[Any] = queue.Queue(maxsize=len(groups))
+        self._ending = threading.Event()
+        self._workers: dict[int, Worker] = {}
+        self._threads = [
+            threading.Thread(
+                target=self._drive, args=(place,), daemon=True, name=f"study worker {place}"
+            )
+            for place in range(len(groups))
+        ]
+
+    def start(self) -> None:
+        for thread in self._threads:
+            thread.start()
+
+    def next_done(self) -> tuple[Chunk, *Results]:
+        """Wait for a chunk's results, or raise what one of the threads met."""
+        result = self._done.get()
+        if isinstance(result, Exception):
+            raise result
+        return result
+
+    def end(self) -> None:
+        """Kill the workers and wait for the threads."""
+        self._ending.set()
+        for thread in self._threads:
+            # Killed again and again, since the thread may just have started a worker.
+            while thread.is_alive():
+                for worker in list(self._workers.values()):
+                    worker.process.kill()
+                thread.join(_POLL_S)
+        for worker in list(self._workers.values()):
+            worker.end()
+
+    def _drive(self, place: int) -> None:
         try:
-            while not ending.is_set():
-                chunk = waiting.get_nowait()
-                hand_over((chunk, *_computed(place, chunk)))
+            while not self._ending.is_set():
+                chunk = self._waiting.get_nowait()
+                self._hand_over((chunk, *self._computed(place, chunk)))
         except queue.Empty:
             return
         except Exception as error:
-            hand_over(error)
+            self._hand_over(error)
 
-    def _computed(place: int, chunk: Chunk) -> Results:
+    def _hand_over(self, result: Any) -> None:
+        while not self._ending.is_set():
+            with contextlib.suppress(queue.Full):
+                self._done.put(result, timeout=_POLL_S)
+                return
+
+    def _computed(self, place: int, chunk: Chunk) -> Results:
+        """A chunk's results; a worker that dies is replaced."""
         for _ in range(MOST_DEATHS):
-            if place not in workers:
-                workers[place] = Worker(spec, groups[place])
-            found = workers[place].compute(chunk)
+            if place not in self._workers:
+                self._workers[place] = Worker(self._spec, self._groups[place])
+            found = self._workers[place].compute(chunk)
             if found is not None:
                 return found
-            workers.pop(place).end()
-            if ending.is_set():
+            self._workers.pop(place).end()
+            if self._ending.is_set():
                 break
         raise CalibrationError(f"chunk {chunk.index}: {MOST_DEATHS} workers died computing it")
-
-    threads = [
-        threading.Thread(target=drive, args=(place,), daemon=True, name=f"study worker {place}")
-        for place in range(len(groups))
-    ]
-    for thread in threads:
-        thread.start()
-    try:
-        for _ in chunks:
-            result = done.get()
-            if isinstance(result, Exception):
-                raise result
-            yield result
-    finally:
-        ending.set()
-        for thread in threads:
-            # Killed again and again, since the thread may just have started a worker.
-            while thread.is_alive():
-                for worker in list(workers.values()):
-                    worker.process.kill()
-                thread.join(_POLL_S)
-        for worker in list(workers.values()):
-            worker.end()
 
 
 def core_groups(workers: int) -> list[set[int]]:
