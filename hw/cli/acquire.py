@@ -144,36 +144,18 @@ def acquire(
         raise InputError("--unattended needs --move")
     if view and not (bench or move):
         raise InputError("--view needs --move: a dry run has nothing to show")
-    from hw.acquisition.request import AcquisitionRequest, recorded_request
-    from hw.recording.check import check_resumable
-    from hw.runtime.extras import missing
-
+    request = None
     if resume:
         assert recording is not None
-        check_resumable(recording)
-        recorded = recorded_request(recording)
-        if bench != (recorded.bench is not None):
-            where = "a real bench" if bench else "the emulated bench"
-            raise InputError(f"the recording was begun on {where}: resume it there")
+        recorded = _recorded(recording, bench)
         bench_seed, phantom, operator = recorded.bench, recorded.phantom, recorded.operator
-    needed: dict[str, Extra] = {"rtde_control": "robot"} if bench or move else {}
-    if bench and phantom in (None, PHANTOMS[0]):
-        needed |= {"cobs": "serial", "serial": "serial"}
-    for module, extra in needed.items():
-        # Before a file is made, and before anybody is asked to confirm a plan.
-        if (cure := missing(module, extra=extra)) is not None:
-            raise InputError(cure)
-    path = recording or f"acquisition-{datetime.now():%Y%m%d-%H%M%S}.h5"
-    from jaxcal.runtime.jax_cache import enable_compilation_cache
+    else:
+        from hw.acquisition.request import AcquisitionRequest
 
-    enable_compilation_cache()
-
-    request = None
-    if operator is None:
-        asks = placement == "pattern-injection" and not bench
-        operator = "person" if asks else "simulated"
-    if not resume:
         phantom = phantom or PHANTOMS[0]
+        if operator is None:
+            asks = placement == "pattern-injection" and not bench
+            operator = "person" if asks else "simulated"
         request = AcquisitionRequest(
             images or 60,
             placement or PLACEMENTS_OF[phantom][0],
@@ -185,6 +167,11 @@ def acquire(
             until_tre,
             phantom,
         )
+    _check_installed(phantom, bench, move)
+    path = recording or f"acquisition-{datetime.now():%Y%m%d-%H%M%S}.h5"
+    from jaxcal.runtime.jax_cache import enable_compilation_cache
+
+    enable_compilation_cache()
     with ExitStack() as stack:
         emulated = started(stack, bench, bench_seed, speed, controller, phantom)
         setup = setup_of(setup_path, emulated)
@@ -201,6 +188,35 @@ def acquire(
                 raise InputError("--preview draws a new plan; it cannot be used with --resume")
             draw(setup, request, preview)
         return _acquire(setup, path, request, emulated, unattended, operator, view)
+
+
+def _recorded(recording: str, bench: bool) -> AcquisitionRequest:
+    """What was asked for of a recording that is to be resumed.
+
+    Raises:
+        InputError: it cannot be resumed, or not on this bench.
+    """
+    from hw.acquisition.request import recorded_request
+    from hw.recording.check import check_resumable
+
+    check_resumable(recording)
+    recorded = recorded_request(recording)
+    if bench != (recorded.bench is not None):
+        where = "a real bench" if bench else "the emulated bench"
+        raise InputError(f"the recording was begun on {where}: resume it there")
+    return recorded
+
+
+def _check_installed(phantom: str, bench: bool, move: bool) -> None:
+    """Refuse to begin without the drivers: before a file is made, and before anybody confirms."""
+    from hw.runtime.extras import missing
+
+    needed: dict[str, Extra] = {"rtde_control": "robot"} if bench or move else {}
+    if bench and phantom == PHANTOMS[0]:
+        needed |= {"cobs": "serial", "serial": "serial"}
+    for module, extra in needed.items():
+        if (cure := missing(module, extra=extra)) is not None:
+            raise InputError(cure)
 
 
 def _acquire(
