@@ -154,7 +154,7 @@ def plan(
         raise InputError("--sigma cannot be used with a recording: its images determine the SDs")
     import_engine()
     from jaxcal import design
-    from jaxcal.design.count import MOST_IMAGES
+    from jaxcal.design.count import plan_until
     from jaxcal.io.outputs import begins_with, check_output
     from jaxcal.runtime.jax_cache import enable_compilation_cache
 
@@ -169,24 +169,11 @@ def plan(
             recording, estimate, probe, depth, lateral, cone, turn, seed
         )
     with progress("planning"):
-        count = images or (30 if result is None else 10)
-        if until_tre is not None:
-            if result is None:
-                first = design.plan(candidates, MINIMUM_SELF_TUNING, criterion, polish=False)
-                count = max(design.images_to(first, until_tre), MINIMUM_SELF_TUNING)
-            else:
-                count = max(design.images_to(result, until_tre, candidates), 1)
-        found = design.plan(candidates, min(count, MOST_IMAGES), criterion, result)
-        # A plan by another criterion, or one whose poses fill space, may need more than counted.
-        while until_tre is not None and found.tre_mm[-1] > until_tre:
-            count = len(found) + max(design.images_to(found, until_tre) - len(found), 1)
+        if until_tre is None:
+            count = images or (30 if result is None else 10)
             found = design.plan(candidates, count, criterion, result)
-        if until_tre is not None:
-            # Exchange and polish may have made fewer poses enough.
-            enough = (k for k, error in enumerate(found.tre_mm) if error <= until_tre)
-            found = found.first(
-                max(next(enough, len(found)), MINIMUM_SELF_TUNING if result is None else 1)
-            )
+        else:
+            found = plan_until(candidates, until_tre, criterion, result)
         if figure is not None:
             _draw(found, until_tre, figure)
         record = _record(found, recording, candidates.constraints.region)

@@ -15,7 +15,7 @@ polish.py       moves poses along the gradient on SE(3), inside the constraints
 planning.py     plan, next_poses
 bound.py        an error that no choice among the candidates can go below
 predict.py      predicted errors of a plan
-count.py        images_to: how many images a wanted error takes
+count.py        images_to: how many images a wanted error takes; plan_until: so many poses
 simulated.py    errors of many simulated calibrations at given poses
 words.py        a pose in words, for a person who holds the probe
 figure.py       figure of the plan and of how many images are needed

@@ -1,4 +1,4 @@
-"""How many images a wanted error takes."""
+"""How many images a wanted error takes, and a plan of so many poses."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ import numpy as np
 
 from jaxcal import InputError
 from jaxcal.design.candidates import Candidates
-from jaxcal.design.greedy import MOST_POSES
-from jaxcal.design.planning import Plan, next_poses
+from jaxcal.design.criteria import Criterion
+from jaxcal.design.planning import Plan, next_poses, plan
+from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
 from jaxcal.runtime.given_values import is_number
 
 if TYPE_CHECKING:
@@ -60,7 +61,7 @@ def images_to(
     # A plan is continued by its own criterion, which may need more images.
     criterion = result.criterion if isinstance(result, Plan) else "tre"
     size, now = 16, math.inf
-    while size <= min(MOST_IMAGES, MOST_POSES):
+    while size <= MOST_IMAGES:
         more = next_poses(result, candidates, size, criterion)
         reached = np.flatnonzero(more.tre_mm <= tre_mm)
         if len(reached):
@@ -75,3 +76,37 @@ def images_to(
         f"{tre_mm:g} mm would take more than {MOST_IMAGES} images ({now:.3g} mm with so many): "
         "tilt the probe farther, or make each image better"
     )
+
+
+def plan_until(
+    candidates: Candidates,
+    tre_mm: float,
+    criterion: Criterion = "tre",
+    result: Calibration | None = None,
+) -> Plan:
+    """A plan of as many poses as a wanted target registration error takes.
+
+    Args:
+        candidates: to choose from.
+        tre_mm: wanted root mean square TRE over the region, mm.
+        criterion: of the plan.
+        result: a calibration of the images ``candidates.taken``, to which poses are added. Without
+            it, the plan has at least as many poses as are needed to estimate the SDs.
+
+    Raises:
+        InputError: more than 1000 poses would be needed.
+    """
+    if result is None:
+        least = MINIMUM_SELF_TUNING
+        count = images_to(plan(candidates, least, criterion, polish=False), tre_mm)
+    else:
+        least = 1
+        count = images_to(result, tre_mm, candidates)
+    found = plan(candidates, max(count, least), criterion, result)
+    # A plan by another criterion, or one whose poses fill space, may need more than counted.
+    while found.tre_mm[-1] > tre_mm:
+        more = max(images_to(found, tre_mm) - len(found), 1)
+        found = plan(candidates, len(found) + more, criterion, result)
+    # Exchange and polish may have made fewer poses enough.
+    enough = (k for k, error in enumerate(found.tre_mm) if error <= tre_mm)
+    return found.first(max(next(enough, len(found)), least))
