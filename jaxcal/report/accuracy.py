@@ -70,7 +70,10 @@ def accuracy_record(
 ) -> dict[str, Any]:
     """``tre``, ``limits``, ``influence`` and ``comparison`` of a calibration's record.
 
-    ``wanted`` are further image points for the error, in the images' own unit (px or mm).
+    Args:
+        result: of one problem.
+        recording: with the images of the solve (:func:`as_solved`).
+        wanted: further image points for the error, in the images' own unit (px or mm).
 
     Returns:
         Arrays and plain values; all of them None where X is not observable.
@@ -82,7 +85,6 @@ def accuracy_record(
     problem = answer.problem
     if problem is None:
         answer = answer.with_problem(Problem.from_recording(recording)).numpy()
-    recording = as_solved(recording, answer)
     region = region_of(answer, recording)
     grid = region.grid()[:, [0, 2]]
     weight = mean_of_squares(image_jacobian(answer, grid))

@@ -75,7 +75,8 @@ def calibration_record(
         InputError: test images that cannot be brought to mm (see :func:`check_test_images`).
     """
     answer = result.numpy()
-    precision, precision_set = _precision(answer, recording, test)
+    solved, tested = as_solved(recording, answer), check_test_images(recording, test)
+    images = solved.calibration if tested is None else tested
     scale = answer.scale_mm_per_px
     transform = answer.image_transform()
     full, rows = answer.unknowns_covariance, in_image(answer.blocks)
@@ -107,8 +108,8 @@ def calibration_record(
         "observability": result.observability,
         "rms_mm": answer.rms,
         **certificate_record(answer, recording),
-        "reconstruction_precision_mm": precision,
-        "reconstruction_precision_set": precision_set,
+        "reconstruction_precision_mm": _precision(answer, images),
+        "reconstruction_precision_set": "calibration" if tested is None else "test",
         "scale_mm_per_px": answer.scale_mm_per_px,
         "face_offset_mm": transform.face_offset_mm,
         "range_factor": transform.range_factor,
@@ -127,7 +128,7 @@ def calibration_record(
         "outlier_reasons": outlier_reasons(answer),
         "suspects": suspects(answer),
         "warnings": result.warnings,
-        **accuracy_record(result, recording, tre_points),
+        **accuracy_record(result, solved, tre_points),
     }
     if recording.truth is not None:
         record["truth_error"] = truth_error(answer, recording.truth)
@@ -201,22 +202,16 @@ def plain(value: Any) -> Any:
     return value
 
 
-def _precision(
-    result: Calibration, recording: Recording, test: Recording | None
-) -> tuple[float | None, str]:
-    images = check_test_images(recording, test)
-    name = "calibration" if images is None else "test"
-    if images is None:
-        images = as_solved(recording, result).calibration
+def _precision(result: Calibration, images: Images) -> float | None:
     if images.mask.sum() < 2:
-        return None, name
+        return None
     value = reconstruction_precision(
         np.asarray(result.image_to_probe),
         images.poses,
         _points_mm(images, result),
         images.mask.astype(float),
     )
-    return float(value), name
+    return float(value)
 
 
 def _points_mm(images: Images, result: Calibration) -> Float[np.ndarray, "n 2"]:
