@@ -12,7 +12,7 @@ from hw.cli.common import check_resumed
 from hw.runtime.choices import HAND_PLACEMENTS
 from jaxcal import InputError
 from jaxcal.cli.common import Server, verdict_code
-from jaxcal.cli.sequence_options import spacing_option
+from jaxcal.cli.sequence_options import probe_frame_option, region_option, spacing_option
 
 
 @click.command("free-hand", short_help="Acquire with a hand-held probe, and calibrate.")
@@ -21,7 +21,7 @@ from jaxcal.cli.sequence_options import spacing_option
 @click.option(
     "--images", type=click.IntRange(4, 1000), default=30, show_default=True, help="To take."
 )
-@click.option("--from", "source", metavar="FRAME", help="Tracked frame on the probe, e.g. Probe.")
+@probe_frame_option
 @click.option("--to", "target_frame", metavar="FRAME", help="Frame the target rests in.")
 @click.option("--device", metavar="NAME", help="Device of the images, if several are sent.")
 @click.option(
@@ -31,13 +31,7 @@ from jaxcal.cli.sequence_options import spacing_option
     show_default=True,
     help="What to look for: one bright spot, or a crossing of wires.",
 )
-@click.option(
-    "--region",
-    type=int,
-    nargs=4,
-    metavar="COLUMN ROW COLUMNS ROWS",
-    help="Part of the frames to look in, px.",
-)
+@region_option
 @spacing_option
 @click.option(
     "--lag",

@@ -37,10 +37,11 @@ class _Lag(click.ParamType):
         return seconds
 
 
+probe_frame_option = click.option(
+    "--from", "source", metavar="FRAME", help="Tracked frame on the probe, e.g. Probe."
+)
 _TRACKING = (
-    click.option(
-        "--from", "source", metavar="FRAME", help="Tracked frame on the probe, e.g. Probe."
-    ),
+    probe_frame_option,
     click.option(
         "--to",
         "target",
@@ -99,6 +100,13 @@ spacing_option = click.option(
     metavar="LATERAL AXIAL",
     help="Size of a pixel, mm.",
 )
+region_option = click.option(
+    "--region",
+    type=int,
+    nargs=4,
+    metavar="COLUMN ROW COLUMNS ROWS",
+    help="Part of the frames to look in, px: its first column and row, and its size.",
+)
 _SEARCH = (
     click.option(
         "--target",
@@ -106,13 +114,7 @@ _SEARCH = (
         type=click.Choice(["echo", "cross"]),
         help="What to look for in frames: one bright spot (the default), or a crossing of wires.",
     ),
-    click.option(
-        "--region",
-        type=int,
-        nargs=4,
-        metavar="COLUMN ROW COLUMNS ROWS",
-        help="Part of the frames to look in, px: its first column and row, and its size.",
-    ),
+    region_option,
     spacing_option,
     click.option(
         "--spacing-from",
