@@ -144,6 +144,24 @@ def polish(search: Search, candidates: Candidates, chosen: Chosen) -> Float[np.n
         ).sum()
         return bool(near >= search.rules.replicates)
 
+    def better_step(
+        k: int, known: np.ndarray, here: np.ndarray, value: float, slope: np.ndarray, step: float
+    ) -> tuple[np.ndarray, float, np.ndarray, float, np.ndarray] | None:
+        """The next numbers, value, slope, step and pose; None if no step along the slope gains."""
+        direction = slope * scale
+        length = float(np.linalg.norm(direction))
+        if length < 1e-9:
+            return None
+        for _ in range(_HALVINGS):
+            there = _cut_off(here + step * scale * direction / length, candidates)
+            pose = bounds.poses(there[None], x, point)
+            if bounds.keeps(pose, x, point)[0] and not among_too_many(k, pose[0]):
+                better, steeper = evaluate(there, known)
+                if better > value + _LEAST_GAIN:
+                    return there, better, steeper, step, pose[0]
+            step *= 0.5
+        return None
+
     # From outside the constraints, the way into them may cost more than the gradient gives.
     inside = bounds.keeps(poses, x, point)
     for k, filling in enumerate(chosen.filling):
@@ -155,23 +173,10 @@ def polish(search: Search, candidates: Candidates, chosen: Chosen) -> Float[np.n
         value, slope = evaluate(here, known)
         step = _FIRST_STEP
         for _ in range(_STEPS):
-            direction = slope * scale
-            length = float(np.linalg.norm(direction))
-            if length < 1e-9:
+            found = better_step(k, known, here, value, slope, step)
+            if found is None:
                 break
-            moved = False
-            for _ in range(_HALVINGS):
-                there = _cut_off(here + step * scale * direction / length, candidates)
-                pose = bounds.poses(there[None], x, point)
-                if bounds.keeps(pose, x, point)[0] and not among_too_many(k, pose[0]):
-                    better, steeper = evaluate(there, known)
-                    if better > value + _LEAST_GAIN:
-                        here, value, slope, moved = there, better, steeper, True
-                        poses[k] = pose[0]
-                        break
-                step *= 0.5
-            if not moved:
-                break
+            here, value, slope, step, poses[k] = found
         rotations[k] = (poses[k, :3, :3] @ x[:3, :3]).reshape(9)
         places[k] = model.targets(poses[k])
         information = information + _outer(model, poses[k], search.factors) - own
