@@ -64,7 +64,7 @@ def acquire_free_hand(
     with UltrasoundStream(asked.host, asked.port, device=asked.device) as stream:
         posed = PosedImages(stream, asked.source, asked.target_frame, asked.lag_s)
         check_region(asked.rules.region, posed.shape)
-        for line in _found(posed, stream):
+        for line in _found(posed):
             person.say(line)
         if resume:
             recorder = Recorder(path)
@@ -194,7 +194,7 @@ class _Run:
         self._person.say(f"{kind}: {text}")
 
 
-def _found(posed: PosedImages, stream: UltrasoundStream) -> list[str]:
+def _found(posed: PosedImages) -> list[str]:
     lines = [
         f"images of {posed.device!r}; poses from {posed.pair[0]} to {posed.pair[1]} (--from and "
         f"--to choose others; the stream has {', '.join(posed.names)})"

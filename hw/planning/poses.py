@@ -36,6 +36,7 @@ MOST_POSES = 10_000
 # A turn of one degree takes the arm about as long as this many mm.
 _MM_PER_DEGREE = 1.0
 _LEAST_DEPTH_MM = 1.0
+_MOST_ROUNDS = 20
 
 
 @dataclass(frozen=True)
@@ -187,11 +188,11 @@ def _short_tour(poses: np.ndarray, tip: np.ndarray) -> np.ndarray:
     return _two_opt(np.array(tour), cost)
 
 
-def _two_opt(tour: np.ndarray, cost: np.ndarray, rounds: int = 20) -> np.ndarray:
+def _two_opt(tour: np.ndarray, cost: np.ndarray) -> np.ndarray:
     """Reverse pieces of an open tour as long as that shortens it."""
     if len(tour) > 500:
         return tour
-    for _ in range(rounds):
+    for _ in range(_MOST_ROUNDS):
         better = False
         for first in range(1, len(tour) - 2):
             ends = tour[first + 1 :]

@@ -61,7 +61,7 @@ def _with_uncertainty(found: ClosedForm, problem: Problem, plan: SolvePlan) -> C
     seen = ImageErrors.of(unknowns, map_arrays(lambda a: a[None], problem), blocks)
     plane = np.zeros_like(seen.mask)
     residual, axial = seen.from_circle(plane)
-    rows = seen.circle_rows(plane, axial).reshape(-1, size(blocks))
+    rows = seen.circle_rows(axial).reshape(-1, size(blocks))
     errors = residual.ravel()
     information = rows.T @ rows
     used = float(seen.mask.sum())

@@ -87,7 +87,7 @@ def _in_sds(result: Calibration) -> tuple[Float[np.ndarray, "m 3"], Float[np.nda
     else:
         in_plane = np.zeros_like(seen.mask)
         errors, axial = seen.from_circle(in_plane)
-        rows = seen.circle_rows(in_plane, axial)
+        rows = seen.circle_rows(axial)
         sd = np.sqrt(answer.linearisation.variance)[:, None, None]
         order = [0, 2, 1]
         errors, rows = (errors / sd)[..., order], (rows / sd[..., None])[:, :, order]

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from jaxcal import CalibrationError, InputError, MissingExtraError
-from jaxcal.cli.common import Commands, ExitCode, print_json, print_page
+from jaxcal.cli.common import Commands, ExitCode, json_option, print_json, print_page
 
 if TYPE_CHECKING:
     from jaxcal.study.run import Watcher
@@ -84,7 +84,7 @@ def run(spec: str, out: str, resume: bool, workers: int | None, dask: str | None
 
 @study.command(short_help="Print a study's means, SDs, intervals and failures.")
 @click.argument("folder", type=click.Path(), metavar="DIR")
-@click.option("--json", "as_json", is_flag=True, help="One JSON object on standard output.")
+@json_option
 @click.option("--csv", "csv_file", type=click.Path(), metavar="FILE", help="Write the table here.")
 def show(folder: str, as_json: bool, csv_file: str | None) -> int:
     """Print mean, SD, 95 % interval, failures and paired differences of the study in DIR."""

@@ -169,9 +169,7 @@ class ImageErrors:
         residual = self.q - np.stack([self.lateral, elevation, axial], axis=-1)
         return self.mask[..., None] * residual, axial
 
-    def circle_rows(
-        self, elevation: Float[Array, "k n"], axial: Float[Array, "k n"]
-    ) -> Float[Array, "k n 3 p"]:
+    def circle_rows(self, axial: Float[Array, "k n"]) -> Float[Array, "k n 3 p"]:
         """Derivatives of :meth:`from_circle` by the unknowns, the elevation held."""
         rows = motion(self.q, self.turned, self.blocks) * self.mask[..., None, None]
         further = size(RIGID)

@@ -251,7 +251,7 @@ def _equal_weights(
 ) -> _Errors:
     """Errors with one SD; the part along a ``free`` offset's circle is projected out."""
     residual, axial = seen.from_circle(y)
-    rows = seen.circle_rows(y, axial)[0][used]
+    rows = seen.circle_rows(axial)[0][used]
     errors = residual[0][used]
     if free is not None:
         slope = (y / axial)[0][used]

@@ -235,7 +235,7 @@ def _offsets(
         force = slope * residual[..., 2] - residual[..., 1]
         near = np.abs(y) >= (1 - AT_BOUND) * limit
         at_bound = (kept & near & (np.sign(y) * force <= 0)).astype(float)
-        rows = seen.circle_rows(y, axial)
+        rows = seen.circle_rows(axial)
         through = slope[..., None] * rows[..., 2, :] - rows[..., 1, :]
         weight = 1 + slope**2
         total = size * (quadratic(through, inverse) / weight + 1) / weight

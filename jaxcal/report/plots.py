@@ -34,6 +34,8 @@ BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
 """Colours of Okabe and Ito, which the colour-blind can tell apart; each kind of error has one."""
 _ROUNDING = 3e-14
 """An excess of the objective below this relative size is only rounding."""
+_ALONG_A_SIDE = 61
+"""Points along each side of the map of the error."""
 COLOURS = {"lateral": BLUE, "range": GREEN, "axial": GREEN, "elevational": ORANGE}
 
 
@@ -55,21 +57,20 @@ def styled(axes: Axes) -> Axes:
     return axes
 
 
-def plot_tre(calibration: Calibration, factor: float = 1.0, points: int = 61) -> Figure:
+def plot_tre(calibration: Calibration, factor: float = 1.0) -> Figure:
     """Map over the image of the target registration error to expect, mm.
 
     Args:
         calibration: of one problem, with concrete values.
         factor: how many times the error that the covariance states is to be expected
             (``tre.factor`` of the calibration's record).
-        points: along each side of the map.
 
     Raises:
         InputError: X is not observable.
     """
     answer, recording = _determined(calibration, "there is no error to map")
     region = region_of(answer, recording)
-    side = np.linspace(-1.0, 1.0, points)
+    side = np.linspace(-1.0, 1.0, _ALONG_A_SIDE)
     cells = region.place(np.stack(np.meshgrid(side, side), axis=-1))[..., [0, 2]]
     error = factor * tre_at(answer, cells).rms
     figure = canvas(COLUMN_MM, COLUMN_MM)
