@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from jaxcal.data.probe import Probe
     from jaxcal.data.recording import Recording
     from jaxcal.data.segmentation.segment import Segmentation
+    from jaxcal.io.target_search import FrameResults
 
 
 @click.command(short_help="Find the target in times of flight or in images.")
@@ -169,7 +170,6 @@ def _segment_frames(source: str, out: str | None, as_json: bool, options: dict[s
     from jaxcal.io.import_options import ImportOptions
     from jaxcal.io.importing import import_files
     from jaxcal.io.outputs import RECORDING, check_output, is_recording
-    from jaxcal.io.target_search import FATES
 
     target = _default_out(source) if out is None else out
     check_output(target, "a recording", is_recording, [source], endings=RECORDING)
@@ -180,49 +180,69 @@ def _segment_frames(source: str, out: str | None, as_json: bool, options: dict[s
         recording, notes, found = import_files([source], ImportOptions(**options))
     assert found is not None
     save(recording, target, found)
-    images = recording.calibration
     if as_json:
-        print_json(
+        print_json(_frames_record(target, recording, notes, found))
+    else:
+        told = _frames_lines(target, recording, notes, found)
+        print_page(*told, *_by_hand(source, found, options))
+    return ExitCode.CONVERGED
+
+
+def _frames_record(
+    target: str, recording: Recording, notes: list[str], found: FrameResults
+) -> dict[str, Any]:
+    from jaxcal.io.target_search import FATES
+
+    images = recording.calibration
+    return {
+        "out": target,
+        "method": found.target,
+        "frames": len(found),
+        **{name.replace(" ", "_"): count for name, count in found.counts.items()},
+        "reasons": found.reasons,
+        "images": len(images),
+        "spacing_mm": None if images.spacing_mm is None else images.spacing_mm.tolist(),
+        "per_frame": [
             {
-                "out": target,
-                "method": found.target,
-                "frames": len(found),
-                **{name.replace(" ", "_"): count for name, count in found.counts.items()},
-                "reasons": found.reasons,
-                "images": len(images),
-                "spacing_mm": None if images.spacing_mm is None else images.spacing_mm.tolist(),
-                "per_frame": [
-                    {
-                        **({"file": found.files[k]} if found.files else {"frame": k}),
-                        "fate": FATES[fate],
-                        "reason": found.reason[k] or None,
-                    }
-                    for k, fate in enumerate(found.fate)
-                ],
-                "notes": notes,
+                **({"file": found.files[k]} if found.files else {"frame": k}),
+                "fate": FATES[fate],
+                "reason": found.reason[k] or None,
             }
-        )
-        return ExitCode.CONVERGED
-    unscaled = images.spacing_mm is None
+            for k, fate in enumerate(found.fate)
+        ],
+        "notes": notes,
+    }
+
+
+def _frames_lines(
+    target: str, recording: Recording, notes: list[str], found: FrameResults
+) -> list[str]:
+    unscaled = recording.calibration.spacing_mm is None
     hint = "; a pixel's size is not known: calibrate with --estimate scale" if unscaled else ""
     counts = found.counts
     first = f"{target}: {counts['found']} of {len(found)} frames segmented ({found.target}){hint}"
     others = ", ".join(
         f"{count} {name}" for name, count in counts.items() if count and name != "found"
     )
-    lines = [first, *([f"- other frames: {others}"] if others else [])]
-    lines += [f"- not credible: {count} x {why}" for why, count in found.reasons.items()]
-    lines += [f"- {note}" for note in notes if "left out" not in note]
-    if counts["not credible"] > counts["found"]:
-        again = given_options(options, orientation=True)
-        later = ", and import them with --lag auto" if options["lag_s"] == "auto" else ""
-        lines += [
-            "- few show a credible target: check --region and --target, or place the points by "
-            f"hand{later}:",
-            Verbatim("  " + shlex.join(["jaxcal", "pick", source, *again])),
-        ]
-    print_page(*lines)
-    return ExitCode.CONVERGED
+    return [
+        first,
+        *([f"- other frames: {others}"] if others else []),
+        *(f"- not credible: {count} x {why}" for why, count in found.reasons.items()),
+        *(f"- {note}" for note in notes if "left out" not in note),
+    ]
+
+
+def _by_hand(source: str, found: FrameResults, options: dict[str, Any]) -> list[str]:
+    """The command that places points by hand, where the target was found in few frames."""
+    if found.counts["not credible"] <= found.counts["found"]:
+        return []
+    again = given_options(options, orientation=True)
+    later = ", and import them with --lag auto" if options["lag_s"] == "auto" else ""
+    return [
+        "- few show a credible target: check --region and --target, or place the points by "
+        f"hand{later}:",
+        Verbatim("  " + shlex.join(["jaxcal", "pick", source, *again])),
+    ]
 
 
 def _probe(data: Recording, sound_speed: float | None, temperature: float | None) -> Probe | None:
