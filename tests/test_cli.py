@@ -856,6 +856,7 @@ def test_plans_that_cannot_be(capfd, tmp_path):
         (["--images", 10, "--cone", 0, "--turn", 0], "would not determine"),
         (["--estimate", "scale"], "needs a recording"),
         (["--depth", 80, 20], "in order"),
+        (["--lateral", 30], "reaches 29.2 mm to either side"),
         (["--images", 2], "between 4 and"),
         ([tmp_path / "absent.h5"], "absent"),
         (["--images", 5, "--figure", tmp_path / "no" / "p.png"], "folder does not exist"),

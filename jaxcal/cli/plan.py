@@ -212,6 +212,11 @@ def _from_nothing(
     from jaxcal.data.probe import PRESETS
 
     transducer = PRESETS[probe]
+    half = 0.5 * transducer.width_mm
+    if lateral is not None and lateral > half:
+        raise InputError(
+            f"--lateral {lateral:g}: the image of this probe reaches {half:.1f} mm to either side"
+        )
     bounds = design.Constraints(
         region=_region(design.Region.of_probe(transducer), depth, lateral),
         cone_deg=40.0 if cone is None else cone,
