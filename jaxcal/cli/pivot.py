@@ -28,13 +28,14 @@ def pivot(poses: str, no_robust: bool, as_json: bool) -> int:
     """
     import_engine()
     from jaxcal.calibration.pivot import calibrate_pivot
+    from jaxcal.io.readable import naming
     from jaxcal.io.text import read_poses
     from jaxcal.report.pivot import pivot_lines
     from jaxcal.runtime.jax_cache import enable_compilation_cache
 
     measured = read_poses(poses)
     enable_compilation_cache()
-    with progress("calibrating the pivot"):
+    with progress("calibrating the pivot"), naming(poses):
         record = calibrate_pivot(measured, robust=not no_robust).record()
     if as_json:
         print_json(record)
