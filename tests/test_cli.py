@@ -449,6 +449,7 @@ def test_pixels_without_a_spacing_are_refused(capfd, recording, tmp_path):
     made = make_images(images.poses, images.measurements * 10, "pixel")
     jaxcal.save(Recording(made), tmp_path / "pixels.h5")
     line = refused(capfd, "calibrate", tmp_path / "pixels.h5", "--out", tmp_path / "report")
+    assert "pixels.h5: the pixels have no spacing_mm" in line
     assert "--estimate scale" in line
     assert not (tmp_path / "report").exists()
 

@@ -25,6 +25,7 @@ def calibrate_and_print(path: str, *lines: str) -> dict[str, Any]:
     from jaxcal.calibration.calibrate import calibrate
     from jaxcal.cli.common import Verbatim, print_page, segmented
     from jaxcal.io.hdf5 import load
+    from jaxcal.io.readable import naming
     from jaxcal.report.record import calibration_record
     from jaxcal.report.tables import calibration_table
     from jaxcal.report.verdict import verdict
@@ -32,7 +33,9 @@ def calibrate_and_print(path: str, *lines: str) -> dict[str, Any]:
     recording, notes = segmented(load(path))
     images = recording.calibration
     scale = ("scale",) if images.kind == "pixel" and images.spacing_mm is None else ()
-    record = calibration_record(calibrate(recording, estimate=scale), recording)
+    with naming(path):
+        result = calibrate(recording, estimate=scale)
+    record = calibration_record(result, recording)
     record["warnings"] += notes
     hint = " --estimate scale" if scale else ""
     again = f"jaxcal calibrate {shlex.quote(path)}{hint} --report report.html"

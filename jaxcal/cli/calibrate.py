@@ -219,6 +219,7 @@ def calibrate(
     check_request(request)
     _check_apart(targets, report, out)
     from jaxcal.io.hdf5 import load
+    from jaxcal.io.readable import naming
     from jaxcal.report.accuracy import settle
     from jaxcal.report.next_poses import next_poses_record
     from jaxcal.report.record import calibration_record, check_test_images
@@ -238,13 +239,13 @@ def calibrate(
             check_page(report, inputs)
         with progress(f"calibrating ({method})") as show:
             traced = folder is not None and method == "conventional"
-            with _first_answer(measured, request, show):
+            with _first_answer(measured, request, show), naming(recording):
                 result = _solve(measured, request, traced=traced)
             record = calibration_record(result, measured, test_data, tre_points)
             record["warnings"] += notes
             record["next_poses"] = next_poses_record(result, measured)
         if cross_validate or bootstrap is not None:
-            with progress("calibrating over and over"):
+            with progress("calibrating over and over"), naming(recording):
                 record |= _resampled(measured, request, result, cross_validate, bootstrap)
             settle(record)
         if folder is not None:

@@ -178,8 +178,10 @@ def segmented(recording: Recording) -> tuple[Recording, list[str]]:
             "images do not: segment them first"
         )
     from jaxcal.data.segmentation.segment import segment_recording
+    from jaxcal.io.readable import naming
 
-    points, found = segment_recording(recording)
+    with naming(recording.source):
+        points, found = segment_recording(recording)
     return points, list(found.warnings)
 
 

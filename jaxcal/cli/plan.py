@@ -242,6 +242,7 @@ def _from_recording(
     from jaxcal.calibration.calibrate import calibrate, unknown_names
     from jaxcal.data.probe import PRESETS
     from jaxcal.io.hdf5 import load
+    from jaxcal.io.readable import naming
     from jaxcal.report.next_poses import NOT_PLANNED
 
     names = unknown_names(estimate)
@@ -251,7 +252,7 @@ def _from_recording(
             "wrong: leave it out here"
         )
     measured, _ = segmented(load(path))
-    with progress("calibrating"):
+    with progress("calibrating"), naming(path):
         result = calibrate(measured, estimate=names)
     if result.status == "failed":
         raise InputError(f"{path}: the calibration failed: there is nothing to plan from")
