@@ -66,7 +66,7 @@ class Eliminated(Observation):
         bounds: the same with offsets that are unknowns of their own.
     """
 
-    sigma: Float[Array, "1 lanes"]
+    sigma: Float[Array, "1 batch"]
     bounds: BoundedOffsets
     whitened: ClassVar[bool] = False
 
@@ -152,14 +152,16 @@ class Bench:
         self.bound = jnp.asarray(self.bounds)[:, None] * jnp.ones(same.IMAGES)
         self.tests = tests_of(self.problems, self.settings)
         self.starts = same.conventional_starts(self.problems)
-        lane = (self.problems, self.starts, self.bound)
+        begun = (self.problems, self.starts, self.bound)
         self._solve = {
-            name: same.chunked(_arm(*arm), *lane, jnp.ones(count)) for name, arm in ARMS.items()
+            name: same.chunked(_arm(*arm), *begun, jnp.ones(count)) for name, arm in ARMS.items()
         }
         steps = jnp.ones(count, jnp.int32)
-        self._alternate = same.chunked(_alternation, *lane, jnp.ones(count), jnp.ones(count), steps)
-        self._three = same.chunked(_three_starts, *lane)
-        self._judge = same.chunked(_judgement, *lane, *self.tests)
+        self._alternate = same.chunked(
+            _alternation, *begun, jnp.ones(count), jnp.ones(count), steps
+        )
+        self._three = same.chunked(_three_starts, *begun)
+        self._judge = same.chunked(_judgement, *begun, *self.tests)
 
     def solve(self, name: str, starts: Parameters, tolerance: float) -> tuple[Any, float]:
         """A second-order arm's fits from the starts, and the seconds that they took."""
@@ -194,8 +196,8 @@ class Bench:
         def information(problems: Problem, parameters: Parameters, bound: Array) -> Array:
             return jnp.moveaxis(_normal(problems, parameters, bound)[0].stacked(), -1, 0)
 
-        lane = (self.problems, parameters, self.bound)
-        found, _ = same.chunked(information, *lane)(*lane)
+        at = (self.problems, parameters, self.bound)
+        found, _ = same.chunked(information, *at)(*at)
         return same.spectra(np.asarray(found), self.problems)[0]
 
 
@@ -275,7 +277,7 @@ def _alternation(
 
 def _normal(
     problems: Problem, parameters: Parameters, bound: Array
-) -> tuple[Normal, Float[Array, " lanes"]]:
+) -> tuple[Normal, Float[Array, " batch"]]:
     """Normal equations of the bounded problem, offsets eliminated; the cost that is rounding."""
     images = ImagePlanes.of(problems)
     place, observation = Iterate.of(parameters, RIGID), BoundedOffsets.of(bound, images)

@@ -199,8 +199,8 @@ def main() -> None:
         done = advance(problems, starts, bound, TOLERANCE, TOLERANCE, rounds)
         return Segment(done.place.parameters(), done.cost, done.settled)
 
-    lanes = jnp.zeros(count, jnp.int32)
-    go_on = chunked(segment, problems, starts, per_image, lanes)
+    taken = jnp.zeros(count, jnp.int32)
+    go_on = chunked(segment, problems, starts, per_image, taken)
     here, done, seconds = starts, 0, 0.0
     costs, elapsed, finished = [], [], np.zeros(count, bool)
     for rounds in ROUNDS:

@@ -33,8 +33,8 @@ class PlacedOffsets(Observation):
         offset_sd: of every image's offset, mm.
     """
 
-    sigma: Float[Array, "3 lanes"]
-    offset_sd: Float[Array, "lanes n"]
+    sigma: Float[Array, "3 batch"]
+    offset_sd: Float[Array, "batch n"]
 
     def components(self, q: list, further: Further, images: ImagePlanes) -> list[Component]:
         """Errors in the plane, and offsets in their SDs."""
@@ -60,9 +60,9 @@ def _minimised(problem: Problem, offset_sd: Array, sigma: Array) -> tuple[Array,
 
 
 def own_sds(
-    problem: Problem, offset_sd: Float[np.ndarray, "lanes n"], sigma: Float[np.ndarray, "lanes 2"]
-) -> Float[np.ndarray, "lanes 4 4"]:
-    """X of every lane by Gaussian offsets with an SD for each image.
+    problem: Problem, offset_sd: Float[np.ndarray, "batch n"], sigma: Float[np.ndarray, "batch 2"]
+) -> Float[np.ndarray, "batch 4 4"]:
+    """X of every problem by Gaussian offsets with an SD for each image.
 
     Args:
         problem: a batch.

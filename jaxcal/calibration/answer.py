@@ -33,7 +33,7 @@ from jaxcal.model.thresholds import LARGEST_ELEVATION, MINIMUM_SELF_TUNING
 from jaxcal.model.unknowns import EXTRA, TABLE, Blocks, block_slice, measured, size
 from jaxcal.result.calibration import Calibration, Linearisation, Medium, Status
 from jaxcal.solvers.convergence import Convergence
-from jaxcal.solvers.dense import inverse_lanes_last
+from jaxcal.solvers.dense import inverse_batch_last
 from jaxcal.solvers.plan import Given, SolvePlan
 
 LEAST_GAP_MM = 1e-6
@@ -77,8 +77,8 @@ class Average(eqx.Module):
         law: the result about the distribution of the offsets.
     """
 
-    covariance: Float[Array, "lanes p p"]
-    elevation_sd: Float[Array, "lanes n"]
+    covariance: Float[Array, "batch p p"]
+    elevation_sd: Float[Array, "batch n"]
     law: OffsetLaw
 
 
@@ -103,7 +103,7 @@ def assemble(
     """
     problem = problem.cleared(problem.mask)
     # Without this barrier the compiler would repeat the end of the solve for every image. The
-    # matrices stay without, so that they are not moved from lanes last and back.
+    # matrices stay outside it: it would move their batch axis to the front, and back again.
     parts = (solved.parameters, solved.offset, solved.sigma, solved.bound, solved.convergence)
     parameters, offset, sigma, bound, convergence = barrier(parts)
     information, design = solved.information, solved.design
@@ -183,7 +183,7 @@ def _further(parameters: Parameters, blocks: Blocks) -> Float[Array, "*batch k"]
 
 
 class Errors(eqx.Module):
-    """The target in every image, and what was measured; arrays are (lanes, n).
+    """The target in every image, and what was measured; arrays are (batch, n).
 
     Attributes:
         q: lateral, elevational and axial coordinate of the target, mm; (0, 0, 1) where left out.
@@ -283,21 +283,21 @@ class Observability(eqx.Module):
         singular: degenerate, or the information with the active bounds is singular.
     """
 
-    degenerate: Bool[Array, " lanes"]
-    weak: Bool[Array, " lanes"]
-    singular: Bool[Array, " lanes"]
+    degenerate: Bool[Array, " batch"]
+    weak: Bool[Array, " batch"]
+    singular: Bool[Array, " batch"]
 
 
 def covariance_and_observability(
-    information: Float[Array, "p p lanes"],
-    design: Float[Array, "p p lanes"],
-    variance: Float[Array, " lanes"],
-    scale: Float[Array, "p lanes"],
-    reach: Float[Array, " lanes"],
+    information: Float[Array, "p p batch"],
+    design: Float[Array, "p p batch"],
+    variance: Float[Array, " batch"],
+    scale: Float[Array, "p batch"],
+    reach: Float[Array, " batch"],
     *,
     bounded: bool = False,
-) -> tuple[Float[Array, "p p lanes"], Observability]:
-    """Covariance (NaN where there is none) and observability, by one elimination; lanes last.
+) -> tuple[Float[Array, "p p batch"], Observability]:
+    """Covariance (NaN where there is none) and observability, by one elimination; batch axis last.
 
     Args:
         information: of the unknowns, offsets eliminated.
@@ -308,7 +308,7 @@ def covariance_and_observability(
         bounded: bounds confine the offsets, and with them every direction, so all that matters
             about the information is whether it is singular.
     """
-    lanes, eps = variance.shape[0], float(jnp.finfo(scale.dtype).eps)
+    count, eps = variance.shape[0], float(jnp.finfo(scale.dtype).eps)
     eye = jnp.eye(len(scale), dtype=scale.dtype)[..., None]
     both = scale[:, None] * scale
     weighted, unweighted = jax.lax.stop_gradient((information / both, design / both))
@@ -319,12 +319,12 @@ def covariance_and_observability(
     ridge = jax.lax.stop_gradient(16 * eps * (design if bounded else information) * eye)
     # A pivot that is not positive makes the logarithm of the determinant not finite.
     matrices = [information + ridge, unweighted - floor * eye]
-    inverse, log_determinant = inverse_lanes_last(jnp.concatenate(matrices, axis=-1))
-    inverse = inverse[..., :lanes]
-    observable = jnp.isfinite(log_determinant[lanes:])
+    inverse, log_determinant = inverse_batch_last(jnp.concatenate(matrices, axis=-1))
+    inverse = inverse[..., :count]
+    observable = jnp.isfinite(log_determinant[count:])
 
-    def exceeding() -> Bool[Array, " lanes"]:
-        return jnp.isfinite(inverse_lanes_last(weighted - least * eye)[1])
+    def exceeding() -> Bool[Array, " batch"]:
+        return jnp.isfinite(inverse_batch_last(weighted - least * eye)[1])
 
     # No eigenvalue of an inverse exceeds its trace; this test nearly always suffices.
     largest = jnp.sum(jnp.diagonal(inverse).T * scale**2, axis=0)

@@ -208,11 +208,11 @@ def _solve_chunks_compiled(
         pieces = -(-pieces // len(devices)) * len(devices)
     else:
         devices = devices[:1]
-    lanes = max(-(-count // pieces), 1)
-    if count and pieces * lanes != count:
-        rows = jnp.arange(pieces * lanes) % count
+    size = max(-(-count // pieces), 1)
+    if count and pieces * size != count:
+        rows = jnp.arange(pieces * size) % count
         problems = jax.tree.map(lambda leaf: leaf[rows], problems)
-    return programs.chunks(devices, alone)(problems, given, plan, lanes)
+    return programs.chunks(devices, alone)(problems, given, plan, size)
 
 
 def _label(plan: SolvePlan, images: int) -> dict[str, Any]:

@@ -32,7 +32,7 @@ def solve_problems(
     problems: Problem,
     given: Given,
     plan: SolvePlan,
-    agreed: Float[Array, "lanes n"] | None = None,
+    agreed: Float[Array, "batch n"] | None = None,
     begun: ConventionalStart | GivenStart | None = None,
 ) -> Calibration:
     """Solve a batch of problems (one leading axis).
@@ -97,7 +97,7 @@ def _solved(
     found = methods.solve(problems, images, given, plan, begun)
     observation = found.observation
     information, design = barrier(_normal_matrices(found, images))
-    offset = jnp.zeros((images.lanes, 0), images.mask.dtype)
+    offset = jnp.zeros((images.batch_size, 0), images.mask.dtype)
     if isinstance(observation, LocalUnknown):
         offset = local_unknowns(found.place, observation, images)
     solved = Solved(
@@ -117,7 +117,7 @@ def _solved(
 
 def _normal_matrices(
     found: Solution, images: ImagePlanes
-) -> tuple[Float[Array, "p p lanes"], Float[Array, "p p lanes"]]:
+) -> tuple[Float[Array, "p p batch"], Float[Array, "p p batch"]]:
     """The weighted normal matrix at a solution, and that of the unweighted components."""
     observation, place = found.observation, found.place
     geometry = observation.geometry(images)

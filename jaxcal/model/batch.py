@@ -1,8 +1,8 @@
 """A batch of problems as planes: the one place where data change their layout.
 
-Public arrays have the problems first and small matrices last. The solvers want the opposite: one
-plane (lanes, images) for every number of an image, and everything else with the lanes last, so
-that XLA vectorises over images and over problems. A *lane* is one problem of a batch.
+Public arrays have the batch axis first and small matrices last. The solvers want the opposite, so
+that XLA vectorises over images and over problems: every number of an image is a *plane*, an array
+(batch, images), and all other arrays have the batch axis last.
 
 Tracker poses are B_i = (R_i, b_i), X = (R, t), the target is c, and q_i = X^-1 B_i^-1 c is the
 target in image i's frame.
@@ -40,13 +40,13 @@ class ElementPlanes(eqx.Module):
         elements: positions in the image frame [lateral, elevational, axial], mm.
     """
 
-    distances: Float[Array, "lanes n elements"]
-    heard: Float[Array, "lanes n elements"]
-    elements: Float[Array, "3 lanes elements"]
+    distances: Float[Array, "batch n elements"]
+    heard: Float[Array, "batch n elements"]
+    elements: Float[Array, "3 batch elements"]
 
 
 class ImagePlanes(eqx.Module):
-    """What was measured, one plane (lanes, images) for every number.
+    """What was measured, one plane (batch, images) for every number.
 
     Attributes:
         rotation: R_i by rows.
@@ -58,12 +58,12 @@ class ImagePlanes(eqx.Module):
         channels: the times of flight, or None.
     """
 
-    rotation: Float[Array, "9 lanes n"]
-    origin: Float[Array, "3 lanes n"]
-    lateral: Float[Array, "lanes n"]
-    axial: Float[Array, "lanes n"]
-    face: Float[Array, " lanes"]
-    mask: Float[Array, "lanes n"]
+    rotation: Float[Array, "9 batch n"]
+    origin: Float[Array, "3 batch n"]
+    lateral: Float[Array, "batch n"]
+    axial: Float[Array, "batch n"]
+    face: Float[Array, " batch"]
+    mask: Float[Array, "batch n"]
     channels: ElementPlanes | None = None
 
     @classmethod
@@ -111,12 +111,12 @@ class ImagePlanes(eqx.Module):
         )
 
     @property
-    def distance(self) -> Float[Array, "lanes n"]:
+    def distance(self) -> Float[Array, "batch n"]:
         """Range at the nominal scale, sound speed and delay, mm."""
         return self.axial + self.face[:, None]
 
     @property
-    def used(self) -> Float[Array, " lanes"]:
+    def used(self) -> Float[Array, " batch"]:
         """Number of used images."""
         return jnp.sum(self.mask, axis=1)
 
@@ -135,7 +135,7 @@ class ImagePlanes(eqx.Module):
         )
 
     def repeated(self, times: int) -> ImagePlanes:
-        """The same points (no times of flight) in ``times`` times the lanes."""
+        """The same points (no times of flight), the whole batch ``times`` times over."""
         return ImagePlanes(
             jnp.tile(self.rotation, (1, times, 1)),
             jnp.tile(self.origin, (1, times, 1)),
@@ -146,13 +146,13 @@ class ImagePlanes(eqx.Module):
         )
 
     @property
-    def lanes(self) -> int:
+    def batch_size(self) -> int:
         """Number of problems."""
         return self.mask.shape[0]
 
 
 class Iterate(eqx.Module):
-    """A value of every lane's unknowns, lanes last.
+    """A value of the unknowns of every problem of a batch; the batch axis is last.
 
     Attributes:
         rotation: of X.
@@ -162,10 +162,10 @@ class Iterate(eqx.Module):
         blocks: which unknowns are free (static).
     """
 
-    rotation: Float[Array, "3 3 lanes"]
-    translation: Float[Array, "3 lanes"]
-    point: Float[Array, "3 lanes"]
-    extras: Float[Array, "extras lanes"]
+    rotation: Float[Array, "3 3 batch"]
+    translation: Float[Array, "3 batch"]
+    point: Float[Array, "3 batch"]
+    extras: Float[Array, "extras batch"]
     blocks: Blocks = eqx.field(static=True)
 
     @classmethod
@@ -188,10 +188,10 @@ class Iterate(eqx.Module):
 
     @property
     def unknowns(self) -> int:
-        """How many unknowns a lane has."""
+        """Number of unknowns of one problem."""
         return size(self.blocks)
 
-    def extra(self, name: str) -> Float[Array, "k lanes"] | None:
+    def extra(self, name: str) -> Float[Array, "k batch"] | None:
         """The values of a further unknown, or None where it is not free."""
         if name not in self.blocks:
             return None
@@ -207,7 +207,7 @@ class Iterate(eqx.Module):
             {name: value.T for name, value in free.items() if value is not None}
         )
 
-    def moved(self, step: Float[Array, "p lanes"] | Vector) -> Iterate:
+    def moved(self, step: Float[Array, "p batch"] | Vector) -> Iterate:
         """The iterate after a step: :func:`jaxcal.model.parameters.retract` to second order.
 
         It turns by Cayley's rotation, which is a rotation for any step and needs no sine.
@@ -231,7 +231,7 @@ class Iterate(eqx.Module):
             self.blocks,
         )
 
-    def step_to(self, other: Iterate) -> Float[Array, "p lanes"]:
+    def step_to(self, other: Iterate) -> Float[Array, "p batch"]:
         """The step that :meth:`moved` takes to get from here to another iterate."""
         back = jnp.swapaxes(self.rotation, 0, 1)
         turn = jnp.sum(back[:, :, None] * other.rotation[None], axis=1)
@@ -247,8 +247,8 @@ class Iterate(eqx.Module):
         return jnp.concatenate(parts)
 
 
-def _cayley(vector: Float[Array, "3 lanes"]) -> Float[Array, "3 3 lanes"]:
-    """:func:`jaxcal.model.unrolled.rotation` of vectors, lanes last."""
+def _cayley(vector: Float[Array, "3 batch"]) -> Float[Array, "3 3 batch"]:
+    """:func:`jaxcal.model.unrolled.rotation` of vectors; batch axis last."""
     half = 0.5 * vector
     square = jnp.sum(half * half, axis=0)
     cross = picked(half, _CROSS_PLACES) * _CROSS_SIGNS.astype(half.dtype)
@@ -284,13 +284,13 @@ def targets(iterate: Iterate, images: ImagePlanes) -> tuple[Vector, Matrix]:
     return unrolled.apply(inverse, in_probe), unrolled.product(inverse, back)
 
 
-def choose(which: Bool[Array, "*lanes"], first, second):
-    """For every lane, one of two pytrees whose last axis counts the lanes."""
+def choose(which: Bool[Array, "*batch"], first, second):
+    """One of two pytrees for every problem; their leaves have the batch axis last."""
     return jax.tree.map(lambda a, b: jnp.where(which, a, b), first, second)
 
 
 def barrier(values):
-    """Keep XLA from fusing across here: it would compute a lane's values again for every image."""
+    """Keep XLA from fusing across here: it would recompute a problem's values for every image."""
     return jax.lax.optimization_barrier(values)
 
 

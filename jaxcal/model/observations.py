@@ -59,7 +59,7 @@ class Further(eqx.Module):
     """What an image sees beside q: the free further unknowns, and where the tracker's axes point.
 
     Attributes:
-        values: by name (:mod:`jaxcal.model.unknowns`), a plane (lanes, 1) for each component.
+        values: by name (:mod:`jaxcal.model.unknowns`), a plane (batch, 1) for each component.
         axes: M_i = R' R_i', which turns directions in the tracker's frame into the image's; it
             may be None where no observation is :attr:`Observation.oriented`.
     """
@@ -93,7 +93,7 @@ class Further(eqx.Module):
         return measured(images.lateral, images.axial, images.face[:, None], self.values)
 
     def heard(self, distance: Array) -> Array:
-        """What elements measure of targets at distances (lanes, n, elements), mm."""
+        """What elements measure of targets at distances (batch, n, elements), mm."""
         planes = {name: [v[..., None] for v in value] for name, value in self.values.items()}
         return heard(distance, planes)
 
@@ -102,7 +102,7 @@ class Component(eqx.Module):
     """Residual planes that share one SD.
 
     Attributes:
-        errors: planes (lanes, n), or (lanes, n, elements), mm.
+        errors: planes (batch, n), or (batch, n, elements), mm.
         present: 1 where there is a residual, in addition to the images' mask; None: everywhere.
     """
 
@@ -120,7 +120,7 @@ class Observation(eqx.Module):
         InputError: an SD that is not positive; inf stands for nothing known.
     """
 
-    sigma: eqx.AbstractVar[Float[Array, "components lanes"]]
+    sigma: eqx.AbstractVar[Float[Array, "components batch"]]
     whitened: ClassVar[bool] = True
     """Whether residuals are in SDs; otherwise their variance is estimated from them."""
     oriented: ClassVar[bool] = False
@@ -133,15 +133,15 @@ class Observation(eqx.Module):
     def components(self, q: Vector, further: Further, images: ImagePlanes) -> list[Component]:
         """Residuals of every image; one entry for each SD."""
 
-    def count(self, images: ImagePlanes) -> Float[Array, "components lanes"]:
+    def count(self, images: ImagePlanes) -> Float[Array, "components batch"]:
         """How many residuals each component has."""
         return jnp.broadcast_to(images.used, self.sigma.shape)
 
-    def with_sigma(self, sigma: Float[Array, "components lanes"]) -> Observation:
+    def with_sigma(self, sigma: Float[Array, "components batch"]) -> Observation:
         """The same with other SDs."""
         return eqx.tree_at(lambda observation: observation.sigma, self, sigma)
 
-    def largest_weight(self) -> Float[Array, " lanes"]:
+    def largest_weight(self) -> Float[Array, " batch"]:
         """Largest change of a whitened residual for a mm of error, 1/mm."""
         return 1 / jnp.min(self.sigma, axis=0)
 
@@ -154,17 +154,17 @@ class Observation(eqx.Module):
         """The same for images that are padded."""
         return self
 
-    def in_units(self, sigma: Float[Array, "components lanes"]) -> Observation:
+    def in_units(self, sigma: Float[Array, "components batch"]) -> Observation:
         """The same for tuning, with residuals in the units that the present SDs set."""
         del sigma
         return self
 
     def growth(
         self,
-        before: Float[Array, "components lanes"],
-        now: Float[Array, "components lanes"],
-        squares: Float[Array, "components lanes"],
-    ) -> Float[Array, " lanes"] | float:
+        before: Float[Array, "components batch"],
+        now: Float[Array, "components batch"],
+        squares: Float[Array, "components batch"],
+    ) -> Float[Array, " batch"] | float:
         """How much half the cost can have grown only because the residuals' units changed.
 
         Args:
@@ -192,7 +192,7 @@ class Points(Observation):
         sigma: SDs of lateral position, range and offset, mm.
     """
 
-    sigma: Float[Array, "3 lanes"]
+    sigma: Float[Array, "3 batch"]
 
     def components(self, q: Vector, further: Further, images: ImagePlanes) -> list[Component]:
         lateral, distance = errors(q, further, images)
@@ -206,7 +206,7 @@ def errors(q: Vector, further: Further, images: ImagePlanes) -> tuple[Array, Arr
     return q[0] - lateral, square * jax.lax.rsqrt(square) - distance
 
 
-def factor_of(shape: Float[Array, "3 lanes n"]) -> tuple[Array, Array, Array]:
+def factor_of(shape: Float[Array, "3 batch n"]) -> tuple[Array, Array, Array]:
     """Cholesky factors of 2x2 matrices: first, off-diagonal and last entry."""
     first = jnp.sqrt(shape[0])
     mixed = shape[1] / first
@@ -225,9 +225,9 @@ class OwnCovariances(Observation):
         tied: whether one factor is the SD of both measurements (static).
     """
 
-    sigma: Float[Array, "components lanes"]
-    shape: Float[Array, "3 lanes n"]
-    ratio: Float[Array, " lanes"]
+    sigma: Float[Array, "components batch"]
+    shape: Float[Array, "3 batch n"]
+    ratio: Float[Array, " batch"]
     tied: bool = eqx.field(static=True, default=False)
 
     def components(self, q: Vector, further: Further, images: ImagePlanes) -> list[Component]:
@@ -240,11 +240,11 @@ class OwnCovariances(Observation):
             return [Component([one, other]), Component([q[1]])]
         return [Component([one]), Component([other]), Component([q[1]])]
 
-    def count(self, images: ImagePlanes) -> Float[Array, "components lanes"]:
+    def count(self, images: ImagePlanes) -> Float[Array, "components batch"]:
         used = images.used
         return jnp.stack([2 * used, used] if self.tied else [used] * 3)
 
-    def in_units(self, sigma: Float[Array, "components lanes"]) -> OwnCovariances:
+    def in_units(self, sigma: Float[Array, "components batch"]) -> OwnCovariances:
         if self.tied:
             return self
         ratio = sigma[1] / sigma[0]
@@ -254,10 +254,10 @@ class OwnCovariances(Observation):
 
     def growth(
         self,
-        before: Float[Array, "components lanes"],
-        now: Float[Array, "components lanes"],
-        squares: Float[Array, "components lanes"],
-    ) -> Float[Array, " lanes"] | float:
+        before: Float[Array, "components batch"],
+        now: Float[Array, "components batch"],
+        squares: Float[Array, "components batch"],
+    ) -> Float[Array, " batch"] | float:
         if self.tied:
             return 0.0
         # The second residual contains at most this share of the first; then Cauchy-Schwarz.
@@ -269,7 +269,7 @@ class OwnCovariances(Observation):
         growth = change * part * jnp.sqrt(squares[0] * squares[1])
         return jnp.where(part > 0, growth, 0.0)
 
-    def with_sigma(self, sigma: Float[Array, "components lanes"]) -> Observation:
+    def with_sigma(self, sigma: Float[Array, "components batch"]) -> Observation:
         return super().with_sigma(sigma).in_units(sigma)
 
     def geometry(self, images: ImagePlanes) -> Observation:
@@ -279,14 +279,14 @@ class OwnCovariances(Observation):
         return eqx.tree_at(lambda o: o.shape, self, whole(self.shape))
 
 
-def variance_planes(covariance: Float[Array, "lanes n 2 2"]) -> Float[Array, "3 lanes n"]:
+def variance_planes(covariance: Float[Array, "batch n 2 2"]) -> Float[Array, "3 batch n"]:
     """Lateral variance, covariance and range variance as planes."""
     return jnp.stack([covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 1, 1]])
 
 
 def unit_shape(
-    variances: Float[Array, "3 lanes n"], images: ImagePlanes
-) -> tuple[Float[Array, "3 lanes n"], Float[Array, "2 lanes"]]:
+    variances: Float[Array, "3 batch n"], images: ImagePlanes
+) -> tuple[Float[Array, "3 batch n"], Float[Array, "2 batch"]]:
     """Covariances scaled so that the used images' mean variances are 1, and those means, mm^2.
 
     Covariances of zero (exact data) have no shape: they become unit matrices of mean 1.
@@ -313,7 +313,7 @@ class ChannelDistances(Observation):
         sigma: SDs of an element's distance and of the offset, mm.
     """
 
-    sigma: Float[Array, "2 lanes"]
+    sigma: Float[Array, "2 batch"]
 
     def components(self, q: Vector, further: Further, images: ImagePlanes) -> list[Component]:
         channels = images.channels
@@ -325,14 +325,14 @@ class ChannelDistances(Observation):
         exact = further.heard(jnp.sqrt(square))
         return [Component([exact - channels.distances], channels.heard), Component([q[1]])]
 
-    def count(self, images: ImagePlanes) -> Float[Array, "2 lanes"]:
+    def count(self, images: ImagePlanes) -> Float[Array, "2 batch"]:
         assert images.channels is not None
         heard = jnp.sum(images.mask[..., None] * images.channels.heard, axis=(1, 2))
         return jnp.stack([heard, images.used])
 
 
-def _unit(images: ImagePlanes) -> Float[Array, "1 lanes"]:
-    return jnp.ones((1, images.lanes), images.mask.dtype)
+def _unit(images: ImagePlanes) -> Float[Array, "1 batch"]:
+    return jnp.ones((1, images.batch_size), images.mask.dtype)
 
 
 def on_circle(q: Vector, y: Array, further: Further, images: ImagePlanes) -> Vector:
@@ -348,7 +348,7 @@ class InPlane(Observation):
         sigma: one.
     """
 
-    sigma: Float[Array, "1 lanes"]
+    sigma: Float[Array, "1 batch"]
     whitened: ClassVar[bool] = False
 
     @classmethod
@@ -369,12 +369,12 @@ class HeldOffsets(Observation):
         offset: y, mm.
     """
 
-    sigma: Float[Array, "1 lanes"]
-    offset: Float[Array, "lanes n"]
+    sigma: Float[Array, "1 batch"]
+    offset: Float[Array, "batch n"]
     whitened: ClassVar[bool] = False
 
     @classmethod
-    def of(cls, offset: Float[Array, "lanes n"], images: ImagePlanes) -> HeldOffsets:
+    def of(cls, offset: Float[Array, "batch n"], images: ImagePlanes) -> HeldOffsets:
         """For these images."""
         return cls(_unit(images), offset)
 
@@ -408,7 +408,7 @@ class LocalUnknown(Observation):
 
 def local_unknowns(
     iterate: Iterate, observation: LocalUnknown, images: ImagePlanes
-) -> Float[Array, "lanes n"]:
+) -> Float[Array, "batch n"]:
     """Every image's own unknown at its best; 0 for images left out."""
     q, axes = targets(iterate, images)
     return images.mask * observation.local(q, Further.at(iterate, axes), images)[0]
@@ -425,15 +425,15 @@ class BoundedOffsets(LocalUnknown):
         InputError: a bound below zero.
     """
 
-    sigma: Float[Array, "1 lanes"]
-    bound: Float[Array, "lanes n"]
+    sigma: Float[Array, "1 batch"]
+    bound: Float[Array, "batch n"]
     whitened: ClassVar[bool] = False
 
     def __check_init__(self) -> None:
         _check_values("bound", self.bound, zero=True)
 
     @classmethod
-    def of(cls, bound: Float[Array, "lanes n"], images: ImagePlanes) -> BoundedOffsets:
+    def of(cls, bound: Float[Array, "batch n"], images: ImagePlanes) -> BoundedOffsets:
         """For these images."""
         return cls(_unit(images), bound)
 
@@ -481,9 +481,9 @@ class TrackedPoints(LocalUnknown):
         InputError: an SD that is not positive, or a ``tracker_sd`` below zero.
     """
 
-    sigma: Float[Array, "3 lanes"]
-    tracker_sd: Float[Array, " lanes"]
-    shape: Float[Array, "3 lanes n"] | None = None
+    sigma: Float[Array, "3 batch"]
+    tracker_sd: Float[Array, " batch"]
+    shape: Float[Array, "3 batch n"] | None = None
 
     def __check_init__(self) -> None:
         _check_values("tracker_sd", self.tracker_sd, zero=True)
@@ -547,11 +547,11 @@ class MediumPrior(eqx.Module):
         blocks: the free unknowns (static).
     """
 
-    sd: Float[Array, "2 lanes"]
+    sd: Float[Array, "2 batch"]
     blocks: Blocks = eqx.field(static=True)
 
     def repeated(self, times: int) -> MediumPrior:
-        """The same in ``times`` times the lanes."""
+        """The same, the whole batch ``times`` times over."""
         return MediumPrior(jnp.tile(self.sd, (1, times)), self.blocks)
 
     def deviations(self, iterate: Iterate) -> list[tuple[int, Array, Array]]:

@@ -53,7 +53,7 @@ def known(platform: str, flags: Flags) -> Flags:
     if _are_known(platform, items):
         return dict(flags)
     found = {name: value for name, value in items if _are_known(platform, ((name, value),))}
-    # Fast math without NaN and Inf makes a wrong answer of a bad lane: all three or none.
+    # Fast math without NaN and Inf gives a bad problem a wrong answer, not NaN: all three or none.
     if not FAST_MATH.keys() <= found.keys():
         found = {name: value for name, value in found.items() if FAST_MATH.get(name) != value}
     return found

@@ -55,21 +55,21 @@ class Alternation(eqx.Module):
     """
 
     place: Iterate
-    cost: Float[Array, " lanes"]
-    cosine: Float[Array, " lanes"]
-    iterations: Int[Array, " lanes"]
-    settled: Bool[Array, " lanes"]
-    rotation_change: Float[Array, " lanes"]
-    translation_change: Float[Array, " lanes"]
-    trace: Float[Array, "trace lanes"] | None
+    cost: Float[Array, " batch"]
+    cosine: Float[Array, " batch"]
+    iterations: Int[Array, " batch"]
+    settled: Bool[Array, " batch"]
+    rotation_change: Float[Array, " batch"]
+    translation_change: Float[Array, " batch"]
+    trace: Float[Array, "trace batch"] | None
 
 
 class _Rounds(eqx.Module):
     place: Iterate
-    rounds: Int[Array, " lanes"]
-    rotation_change: Float[Array, " lanes"]
-    translation_change: Float[Array, " lanes"]
-    trace: Float[Array, "trace lanes"] | None
+    rounds: Int[Array, " batch"]
+    rotation_change: Float[Array, " batch"]
+    translation_change: Float[Array, " batch"]
+    trace: Float[Array, "trace batch"] | None
 
 
 def alternate(
@@ -103,7 +103,7 @@ def alternate(
         normal = barrier(accumulate(place, held, images, None))
         eye = jnp.eye(len(normal.gradient), dtype=normal.gradient.dtype)[..., None]
         matrix, gradient = barrier((normal.stacked() * (1 + 16 * eps * eye), normal.gradient))
-        return barrier(place.moved(barrier(dense.solve_lanes_last(matrix, -gradient)))), held
+        return barrier(place.moved(barrier(dense.solve_batch_last(matrix, -gradient)))), held
 
     def one_round(state: _Rounds) -> _Rounds:
         held = HeldOffsets.of(barrier(local_unknowns(state.place, observation, images)), images)
@@ -120,7 +120,7 @@ def alternate(
         )
         return choose(active(state), moved, state)
 
-    def active(state: _Rounds) -> Bool[Array, " lanes"]:
+    def active(state: _Rounds) -> Bool[Array, " batch"]:
         moving = state.rotation_change >= tolerance_rad
         moving = moving | (state.translation_change >= tolerance_mm)
         return moving & (state.rounds < max_rounds)
@@ -177,7 +177,7 @@ def bounded(
         step[3] = by * turn
         return start.moved(step)
 
-    # All three starts at once, as three times as many lanes.
+    # All three starts at once, in a batch three times as large.
     starts = jax.tree.map(
         lambda *leaves: jnp.concatenate(leaves, axis=-1), *(turned(by) for by in TURNS)
     )
@@ -193,9 +193,9 @@ def bounded(
         inner_steps=2,
     )
     fits = minimise(warm.place, everywhere, wide, max_steps=max_steps, trace=trace)
-    lanes = images.lanes
+    count = images.batch_size
     parts = [
-        jax.tree.map(lambda leaf, k=k: leaf[..., k * lanes : (k + 1) * lanes], fits)
+        jax.tree.map(lambda leaf, k=k: leaf[..., k * count : (k + 1) * count], fits)
         for k in range(len(TURNS))
     ]
     costs = jnp.stack([jnp.where(jnp.isfinite(fit.cost), fit.cost, jnp.inf) for fit in parts])

@@ -65,7 +65,7 @@ MEDIAN_STEPS = 12
 
 
 class Averaged(eqx.Module):
-    """The estimate over all laws; lanes last, except in the law.
+    """The estimate over all laws; the batch axis is last, except in the law.
 
     Attributes:
         place: the unknowns.
@@ -77,11 +77,11 @@ class Averaged(eqx.Module):
     """
 
     place: Iterate
-    sigma: Float[Array, "components lanes"]
-    covariance: Float[Array, "p p lanes"]
-    elevation_sd: Float[Array, "lanes n"]
+    sigma: Float[Array, "components batch"]
+    covariance: Float[Array, "p p batch"]
+    elevation_sd: Float[Array, "batch n"]
     law: OffsetLaw
-    own_covariances: Bool[Array, " lanes"]
+    own_covariances: Bool[Array, " batch"]
 
 
 def average_over_laws(
@@ -90,8 +90,8 @@ def average_over_laws(
     images: ImagePlanes,
     shapes: tuple[Shape, ...],
     *,
-    variances: Float[Array, "3 lanes n"] | None,
-    bound: Float[Array, "lanes n"] | None,
+    variances: Float[Array, "3 batch n"] | None,
+    bound: Float[Array, "batch n"] | None,
     medium: MediumPrior | None,
 ) -> Averaged:
     """Weigh noise models, offset means and laws of the offsets, and average the answers.
@@ -163,7 +163,7 @@ def average_over_laws(
 
 
 class Linearised(eqx.Module):
-    """A noise model, linearised where it was tuned; lanes last.
+    """A noise model, linearised where it was tuned; batch axis last.
 
     Attributes:
         place: X, c and the further unknowns.
@@ -177,13 +177,13 @@ class Linearised(eqx.Module):
     """
 
     place: Iterate
-    mean: Float[Array, " lanes"]
-    trust: Float[Array, " lanes"]
-    sigma: Float[Array, "components lanes"]
-    information: Float[Array, "triangle lanes"]
-    gradient: Float[Array, "p lanes"]
-    squares: Float[Array, "triangle lanes"]
-    pull: Float[Array, "p lanes"]
+    mean: Float[Array, " batch"]
+    trust: Float[Array, " batch"]
+    sigma: Float[Array, "components batch"]
+    information: Float[Array, "triangle batch"]
+    gradient: Float[Array, "p batch"]
+    squares: Float[Array, "triangle batch"]
+    pull: Float[Array, "p batch"]
 
     @classmethod
     def of(cls, tuned: NoiseModel, sigma: Array) -> Linearised:
@@ -205,7 +205,7 @@ class Linearised(eqx.Module):
             sums.gradient[-1] + tuned.mean * along,
         )
 
-    def offsets_metric(self) -> Float[Array, "q q lanes"]:
+    def offsets_metric(self) -> Float[Array, "q q batch"]:
         """Sum of h_i h_i' with b as the last unknown; b moves the offsets as v_y does."""
         matrix = stacked(self.squares)
         matrix = jnp.concatenate([matrix, matrix[V_Y][None]])
@@ -213,7 +213,7 @@ class Linearised(eqx.Module):
 
 
 class Answers(eqx.Module):
-    """The belief about the unknowns and b under every law, relative to one place; lanes last.
+    """The belief about the unknowns and b under every law, relative to one place; batch axis last.
 
     Attributes:
         mean: of all unknowns and b.
@@ -224,17 +224,17 @@ class Answers(eqx.Module):
             cut it always does.
     """
 
-    mean: Float[Array, "q k lanes"]
-    covariance: Float[Array, "q q k lanes"]
-    weight: Float[Array, "k lanes"]
-    mean_probability: Float[Array, "k lanes"]
-    settled: Bool[Array, " lanes"]
+    mean: Float[Array, "q k batch"]
+    covariance: Float[Array, "q q k batch"]
+    weight: Float[Array, "k batch"]
+    mean_probability: Float[Array, "k batch"]
+    settled: Bool[Array, " batch"]
 
-    def shared(self, share: Float[Array, " lanes"]) -> Answers:
+    def shared(self, share: Float[Array, " batch"]) -> Answers:
         """The answers with a share of their weight."""
         return eqx.tree_at(lambda each: each.weight, self, share * self.weight)
 
-    def seen_from(self, step: Float[Array, "p lanes"], mean: Float[Array, " lanes"]) -> Answers:
+    def seen_from(self, step: Float[Array, "p batch"], mean: Float[Array, " batch"]) -> Answers:
         """The answers relative to another place; ``step`` leads from that one to this one."""
         step = jnp.concatenate([step, mean[None]])
         return eqx.tree_at(lambda each: each.mean, self, self.mean + step[:, None])
@@ -256,7 +256,7 @@ class Answers(eqx.Module):
 
 
 def sites_at(
-    model: Linearised, images: ImagePlanes, bound: Float[Array, "lanes n"] | None
+    model: Linearised, images: ImagePlanes, bound: Float[Array, "batch n"] | None
 ) -> Sites:
     """The offsets of a linearised problem, as the laws see them."""
     q, turned = targets(model.place, images)
@@ -297,9 +297,9 @@ def with_own_covariances(
     common: NoiseModel,
     observation: Points,
     images: ImagePlanes,
-    variances: Float[Array, "3 lanes n"],
+    variances: Float[Array, "3 batch n"],
     medium: MediumPrior | None,
-) -> tuple[Linearised, Float[Array, " lanes"]]:
+) -> tuple[Linearised, Float[Array, " batch"]]:
     """The noise model of the images' own covariances, and ln of how much more probable it is."""
     used, sigma = images.used, common.sigma
     shape, mean = unit_shape(variances, images)
@@ -321,8 +321,8 @@ def with_own_covariances(
 
 
 def median(
-    answers: Answers, metric: Float[Array, "q q lanes"]
-) -> tuple[Float[Array, "q lanes"], Float[Array, "q q lanes"]]:
+    answers: Answers, metric: Float[Array, "q q batch"]
+) -> tuple[Float[Array, "q batch"], Float[Array, "q q batch"]]:
     """The answers' geometric median, and the covariance about it.
 
     Mean RP is the average of a distance, not of its square, so the answer is where the expected
@@ -343,7 +343,7 @@ def median(
     means = answers.mean - centre[:, None]
     # Of the answers, only their scalar products matter.
     forward = jnp.swapaxes(means, 0, 1)[:, :, None]
-    products = jnp.sum(forward * dense.product_lanes_last(metric, means), axis=1)
+    products = jnp.sum(forward * dense.product_batch_last(metric, means), axis=1)
     within, means, products = barrier((within, means, products))
     tiny = jnp.finfo(weight.dtype).tiny
 
@@ -375,6 +375,6 @@ def weights(
     moving = (jnp.where(good, change, 0.0) / LARGEST_CHANGE) ** 4
     score = jnp.where(good, log_evidence, 0.0) + jnp.log(prior) - moving
     score = jnp.where(good, score, -jnp.inf)
-    # Where no law is good the weights must still be numbers: a lane's NaN poisons its gradient.
+    # Where no law is good the weights must still be numbers: a problem's NaN poisons its gradient.
     score = jnp.where(jnp.any(good, axis=0), score, 0.0)
     return jax.nn.softmax(score, axis=0) * good, good

@@ -136,7 +136,7 @@ def find_consensus(problem: Problem, model: ConsensusModel) -> Consensus:
 
     count = finalists(used.shape[0])
     _, best = jax.lax.top_k(-jax.vmap(score)(proposed)[1:], count)
-    # The first lane assumes that all images are good; it competes with those that leave some out.
+    # The first candidate takes all images as good; it competes with those that leave some out.
     chosen = jnp.concatenate([jnp.zeros(1, best.dtype), best + 1])
     everything = jnp.arange(count + 1) == 0
     finished: Consensus

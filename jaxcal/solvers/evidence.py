@@ -54,7 +54,7 @@ V_Y = 1
 
 
 class NoiseModel(eqx.Module):
-    """A Gaussian noise model tuned to the data; lanes last.
+    """A Gaussian noise model tuned to the data; batch axis last.
 
     Attributes:
         place: X, c and the further unknowns.
@@ -65,12 +65,12 @@ class NoiseModel(eqx.Module):
     """
 
     place: Iterate
-    mean: Float[Array, " lanes"]
-    sigma: Float[Array, "k lanes"]
+    mean: Float[Array, " batch"]
+    sigma: Float[Array, "k batch"]
     sums: ComponentSums
-    trust: Float[Array, " lanes"]
+    trust: Float[Array, " batch"]
 
-    def log_evidence(self, count: Float[Array, "k lanes"]) -> Float[Array, " lanes"]:
+    def log_evidence(self, count: Float[Array, "k batch"]) -> Float[Array, " batch"]:
         """Ln Z, up to a constant and the covariances' determinants.
 
         Args:
@@ -93,9 +93,9 @@ class System(eqx.Module):
     """
 
     sums: ComponentSums
-    border: Float[Array, "q lanes"]
-    gradient: Float[Array, "k q lanes"]
-    squares: Float[Array, "k lanes"]
+    border: Float[Array, "q batch"]
+    gradient: Float[Array, "k q batch"]
+    squares: Float[Array, "k batch"]
 
     @classmethod
     def of(cls, sums: ComponentSums, mean: Array) -> System:
@@ -126,13 +126,13 @@ class System(eqx.Module):
         flat, border, gradient = barrier((normal.curvature, border, gradient))
         whole = jnp.concatenate([stacked(flat), border[:-1, None]], axis=1)
         whole = jnp.concatenate([whole, border[None]])
-        inverse, log_determinant = dense.inverse_lanes_last(whole)
-        step = -dense.product_lanes_last(inverse, gradient)
+        inverse, log_determinant = dense.inverse_batch_last(whole)
+        step = -dense.product_batch_last(inverse, gradient)
         # The cost at the minimum, which is a small step away.
         cost = cost + jnp.sum(gradient * step, axis=0)
         return inverse, step, 0.5 * (jnp.log(precision) - cost - log_determinant)
 
-    def traces(self, matrix: Float[Array, "q q lanes"]) -> Float[Array, "k lanes"]:
+    def traces(self, matrix: Float[Array, "q q batch"]) -> Float[Array, "k batch"]:
         """tr(A N_k) of every component, A symmetric."""
         last = matrix.shape[0] - 1
         rows, columns = (np.array(each) for each in zip(*pairs(last), strict=True))
@@ -144,7 +144,7 @@ class System(eqx.Module):
         return found + np.eye(len(found), dtype=matrix.dtype)[-1][:, None] * own
 
 
-def row_of(flat: Float[Array, "triangle lanes"], k: int) -> Float[Array, "p lanes"]:
+def row_of(flat: Float[Array, "triangle batch"], k: int) -> Float[Array, "p batch"]:
     """A row of a symmetric matrix from its upper triangle."""
     return picked(flat, square_places(int((2 * flat.shape[0]) ** 0.5))[k])
 

@@ -48,7 +48,7 @@ from jaxcal.solvers.plan import MOST_STEPS
 
 
 class Flat(eqx.Module):
-    """Unknowns of one lane as a vector, and a local unknown a row where there are some.
+    """Unknowns of one problem as a vector, and a local unknown a row where there are some.
 
     Attributes:
         shared: the unknowns.
@@ -158,7 +158,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
 
 
 def _normal(residual: Callable[[Array], Array], here: Float[Array, " p"]) -> Normal:
-    """Gauss-Newton's normal equations of dense residuals, as those of one lane."""
+    """Gauss-Newton's normal equations of dense residuals, as those of a batch of one."""
     value, push = jax.linearize(residual, here)
     jacobian = jax.vmap(push)(jnp.eye(here.shape[0], dtype=here.dtype))
     return _packed(jacobian @ jacobian.T, jacobian @ value, jnp.sum(value**2), None)

@@ -35,7 +35,7 @@ class SteepestDescent(optx.AbstractGradientDescent):
     verbose: Callable[..., None] = eqx.field(static=True, default=lambda **_: None)
 
 
-def reconstructed(place: Iterate, images: ImagePlanes) -> Float[Array, "3 lanes n"]:
+def reconstructed(place: Iterate, images: ImagePlanes) -> Float[Array, "3 batch n"]:
     """B_i X p_i, the target as reconstructed from every image, in the tracker's frame, mm."""
     lateral, distance = Further.at(place).points(images)
     in_probe = place.rotation[:, 0, :, None] * lateral + place.rotation[:, 2, :, None] * distance
@@ -49,7 +49,7 @@ def pairwise_gradient(start: Iterate, images: ImagePlanes, options: Options) -> 
 
     Args:
         start: first value of the unknowns; pixel scales are held.
-        images: the data, of one lane.
+        images: the data, a batch of one.
         options: the descent stops after a step that lowers the objective by less than the share
             ``gradient_tolerance`` and moves X by less than that share of a radian, or of the lever
             arm.
@@ -65,7 +65,7 @@ def pairwise_gradient(start: Iterate, images: ImagePlanes, options: Options) -> 
     def moved(tangent: Float[Array, 6]) -> Iterate:
         return start.moved(jnp.concatenate([unit * tangent, rest])[:, None])
 
-    def target(place: Iterate) -> Float[Array, "3 lanes"]:
+    def target(place: Iterate) -> Float[Array, "3 batch"]:
         return jnp.sum(images.mask * reconstructed(place, images), axis=2) / count
 
     def cost(tangent: Float[Array, 6], _: None) -> Float[Array, ""]:

@@ -34,7 +34,7 @@ STILL_MM, STILL_RAD = 1e-6, 1e-8
 @jax.custom_jvp
 def optimum(
     place: Iterate, observation: Observation, images: ImagePlanes, medium: MediumPrior | None
-) -> Float[Array, "p lanes"]:
+) -> Float[Array, "p batch"]:
     """How the minimiser of an objective moves with the data and with given numbers.
 
     Args:
@@ -63,18 +63,18 @@ def _optimum_jvp(primals: tuple, tangents: tuple) -> tuple:
     _, moved = jax.jvp(gradient, primals[1:], tangents[1:])
     exact = jnp.ones_like(images.mask[:, 0])
     matrix = accumulate(place, observation, images, exact, medium).stacked()
-    inverse, _ = dense.inverse_lanes_last(matrix)
-    return optimum(*primals), -dense.product_lanes_last(inverse, moved)
+    inverse, _ = dense.inverse_batch_last(matrix)
+    return optimum(*primals), -dense.product_batch_last(inverse, moved)
 
 
 @jax.custom_jvp
 def self_tuned_optimum(
     place: Iterate,
-    sigma: Float[Array, "k lanes"],
+    sigma: Float[Array, "k batch"],
     observation: Observation,
     images: ImagePlanes,
     medium: MediumPrior | None,
-) -> tuple[Float[Array, "p lanes"], Float[Array, "k lanes"]]:
+) -> tuple[Float[Array, "p batch"], Float[Array, "k batch"]]:
     """How a self-tuned solution and its SDs move with the data.
 
     Args:
@@ -108,20 +108,20 @@ def _self_tuned_jvp(primals: tuple, tangents: tuple) -> tuple:
         moving = jnp.broadcast_to(direction[:, None], here.shape)
         return jax.jvp(lambda unknowns: conditions(unknowns, *data), (here,), (moving,))[1]
 
-    # By rows: condition, unknown, lane.
+    # Axes: condition, unknown, batch.
     matrix = jnp.moveaxis(jax.vmap(along)(jnp.eye(len(here), dtype=here.dtype)), 0, 1)
     _, moved = jax.jvp(lambda *data: conditions(here, *data), tuple(data), tuple(tangents[2:]))
     # The gradients' rows scale with 1/sigma^2, those of the SDs have no unit: balance the rows.
     scale = 1 / jnp.max(jnp.abs(matrix), axis=1)
     inverse = jax.vmap(dense.inverse, in_axes=-1, out_axes=-1)(scale[:, None] * matrix)
-    step = -dense.product_lanes_last(inverse, scale * moved)
+    step = -dense.product_batch_last(inverse, scale * moved)
     return self_tuned_optimum(*primals), (step[:count], sigma * step[count:])
 
 
 @jax.custom_jvp
 def stopped_short(
     place: Iterate, observation: Observation, images: ImagePlanes
-) -> Float[Array, "p lanes"]:
+) -> Float[Array, "p batch"]:
     """:func:`optimum` of a method that stopped before the minimum: to differentiate it is an error.
 
     Raises:
@@ -141,8 +141,8 @@ def _stopped_short_jvp(primals: tuple, tangents: tuple) -> tuple:
     )
 
 
-def _no_step(place: Iterate) -> Float[Array, "p lanes"]:
-    # These zeros must depend on the lane: where a custom rule's tangent is batched and its value is
-    # not, JAX (0.10.2) confuses the two when it linearises a scan over batches.
+def _no_step(place: Iterate) -> Float[Array, "p batch"]:
+    # These zeros must depend on a batched array: where a custom rule's tangent is batched and its
+    # value is not, JAX (0.10.2) confuses the two when it linearises a scan over batches.
     zero = jnp.where(jnp.isfinite(place.translation[0]), 0.0, 0.0).astype(place.point.dtype)
     return jnp.broadcast_to(zero, (place.unknowns, *zero.shape))

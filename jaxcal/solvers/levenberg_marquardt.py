@@ -1,9 +1,9 @@
 """Levenberg-Marquardt on many problems side by side, one pass over the images an iteration.
 
-Every lane has its own damping, gate and stopping rule; a lane that has converged keeps its answer
-while the others go on. An iteration evaluates every lane's candidate: the cost decides whether the
-candidate is taken, and the same sums are the normal equations for the next one. The first candidate
-is the start, so that only one loop body has to be compiled.
+Every problem has its own damping, curvature and stopping rule; one that has converged keeps its
+answer while the others go on. An iteration evaluates every problem's candidate: the cost decides
+whether the candidate is taken, and the same sums are the normal equations for the next one. The
+first candidate is the start, so that only one loop body has to be compiled.
 
 The acceptance rule is that of More (1978) with Nielsen's (1999) constants: a step is taken where
 the cost falls by at least a ten-thousandth of the decrease that the quadratic model predicts. The
@@ -12,10 +12,10 @@ refused. Every loop of the package uses this rule, by :func:`judge_step`. Steps 
 where the gradient cosine is above :data:`EXACT_BELOW`, and exact Newton steps below it; where the
 exact matrix is indefinite, the same place is evaluated again without second derivatives.
 
-A lane stops when the largest cosine between its residual and a column of its Jacobian is below the
-tolerance, when its residuals are nothing but rounding, or when steps gain no more than rounding.
-Newton's steps square the cosine. So where its square is well below the tolerance, one last step is
-taken, and its result is not evaluated.
+A problem stops when the largest cosine between its residual and a column of its Jacobian is below
+the tolerance, when its residuals are nothing but rounding, or when steps gain no more than
+rounding. Newton's steps square the cosine. So where its square is well below the tolerance, one
+last step is taken, and its result is not evaluated.
 
 The loop needs normal equations and a retraction, not residuals; :mod:`jaxcal.solvers.general` puts
 it behind optimistix's interface for residuals of any shape.
@@ -49,7 +49,7 @@ LESS, LESS_EXACT, MORE = 0.1, 1e-4, 10.0
 """Factors of the damping after a good Gauss-Newton step, a good exact one, a refused one."""
 
 LEAST_DAMPING, LARGEST_DAMPING = 1e-8, 1e12
-"""Least damping after a refused step, and the damping above which a lane gives up."""
+"""Least damping after a refused step, and the damping above which a problem is given up."""
 
 EXACT_BELOW = 0.2
 """Gradient cosine below which exact second derivatives are used."""
@@ -62,10 +62,10 @@ SMALL = 1e-11
 """Largest predicted relative decrease of the cost by a last step that is not evaluated."""
 
 IDLE = 4
-"""Steps in a row without a gain above rounding before a lane is called settled."""
+"""Steps in a row without a gain above rounding before a problem is called settled."""
 
 
-Equations = Callable[[Any, Float[Array, " lanes"]], Normal]
+Equations = Callable[[Any, Float[Array, " batch"]], Normal]
 """Normal equations at a place, with exact second derivatives where a gate is 1."""
 
 
@@ -78,23 +78,23 @@ class Judged(eqx.Module):
         idle: steps in a row without a gain.
     """
 
-    accept: Bool[Array, " lanes"]
-    damping: Float[Array, " lanes"]
-    idle: Int[Array, " lanes"]
+    accept: Bool[Array, " batch"]
+    damping: Float[Array, " batch"]
+    idle: Int[Array, " batch"]
 
 
 def judge_step(
-    decrease: Float[Array, " lanes"],
-    predicted: Float[Array, " lanes"],
-    half_cost: Float[Array, " lanes"],
-    rounding: Float[Array, " lanes"],
-    damping: Float[Array, " lanes"],
-    idle: Int[Array, " lanes"],
+    decrease: Float[Array, " batch"],
+    predicted: Float[Array, " batch"],
+    half_cost: Float[Array, " batch"],
+    rounding: Float[Array, " batch"],
+    damping: Float[Array, " batch"],
+    idle: Int[Array, " batch"],
     *,
-    exact: Bool[Array, " lanes"],
-    retry: Bool[Array, " lanes"],
+    exact: Bool[Array, " batch"],
+    retry: Bool[Array, " batch"],
     less_exact: float = LESS_EXACT,
-    allowance: Float[Array, " lanes"] | float = 0.0,
+    allowance: Float[Array, " batch"] | float = 0.0,
 ) -> Judged:
     """The acceptance rule.
 
@@ -127,7 +127,7 @@ def judge_step(
 
 
 class Descent(eqx.Module):
-    """The state of every lane.
+    """The state of every problem.
 
     Attributes:
         place: the best so far.
@@ -142,34 +142,34 @@ class Descent(eqx.Module):
         idle: steps in a row without a gain.
         iterations: number of evaluations.
         settled: converged, as far as rounding allows.
-        active: the lane goes on.
+        active: the problem goes on.
         trace: best cost after each of the first evaluations; NaN beyond the last; None: not kept.
     """
 
     place: Any
-    cost: Float[Array, " lanes"]
-    cosine: Float[Array, " lanes"]
+    cost: Float[Array, " batch"]
+    cosine: Float[Array, " batch"]
     candidate: Any
-    retry: Bool[Array, " lanes"]
-    exact_used: Float[Array, " lanes"]
-    exact_next: Float[Array, " lanes"]
-    damping: Float[Array, " lanes"]
-    predicted: Float[Array, " lanes"]
-    idle: Int[Array, " lanes"]
-    iterations: Int[Array, " lanes"]
-    settled: Bool[Array, " lanes"]
-    active: Bool[Array, " lanes"]
-    trace: Float[Array, "trace lanes"] | None = None
+    retry: Bool[Array, " batch"]
+    exact_used: Float[Array, " batch"]
+    exact_next: Float[Array, " batch"]
+    damping: Float[Array, " batch"]
+    predicted: Float[Array, " batch"]
+    idle: Int[Array, " batch"]
+    iterations: Int[Array, " batch"]
+    settled: Bool[Array, " batch"]
+    active: Bool[Array, " batch"]
+    trace: Float[Array, "trace batch"] | None = None
 
     @classmethod
     def before(
-        cls, start: Any, number: Float[Array, " lanes"], damping: float, *, trace: int = 0
+        cls, start: Any, number: Float[Array, " batch"], damping: float, *, trace: int = 0
     ) -> Descent:
         """The state before the first evaluation.
 
         Args:
             start: the first candidate.
-            number: zeros of the lanes' shape.
+            number: zeros, one for every problem.
             damping: first lambda, relative to the diagonal.
             trace: how many values of the cost to keep.
         """
@@ -192,32 +192,32 @@ class Descent(eqx.Module):
         )
 
 
-def empty_trace(length: int, number: Float[Array, " lanes"]) -> Float[Array, "trace lanes"] | None:
-    """A trace without values, for lanes like those of ``number``; None for a length of 0."""
+def empty_trace(length: int, number: Float[Array, " batch"]) -> Float[Array, "trace batch"] | None:
+    """A trace without values, of the batch shape of ``number``; None for a length of 0."""
     return jnp.full((length, *number.shape), jnp.nan, number.dtype) if length else None
 
 
 def recorded(
-    trace: Float[Array, "trace lanes"] | None,
-    at: Int[Array, " lanes"],
-    cost: Float[Array, " lanes"],
-) -> Float[Array, "trace lanes"] | None:
-    """The trace with one more value in each lane; those beyond its end are not kept."""
+    trace: Float[Array, "trace batch"] | None,
+    at: Int[Array, " batch"],
+    cost: Float[Array, " batch"],
+) -> Float[Array, "trace batch"] | None:
+    """The trace with one more value of each problem; those beyond its end are not kept."""
     if trace is None:
         return None
     return jnp.where(jnp.arange(trace.shape[0])[:, None] == at, cost, trace)
 
 
 class Rounding(eqx.Module):
-    """Rounding errors of the residuals due to the size of the coordinates, in each lane.
+    """Rounding errors of the residuals due to the size of the coordinates, for each problem.
 
     Attributes:
         residual: rounding error of one whitened residual.
         vanished: the cost below which residuals are nothing but rounding.
     """
 
-    residual: Float[Array, " lanes"]
-    vanished: Float[Array, " lanes"]
+    residual: Float[Array, " batch"]
+    vanished: Float[Array, " batch"]
 
     @classmethod
     def of(cls, iterate: Iterate, observation: Observation, images: ImagePlanes) -> Rounding:
@@ -231,14 +231,14 @@ class Rounding(eqx.Module):
         return cls(one, 3 * images.mask.shape[1] * (2 * one) ** 2)
 
 
-def reach(iterate: Iterate, images: ImagePlanes) -> Float[Array, " lanes"]:
-    """The largest coordinate of a lane's poses and target, mm."""
+def reach(iterate: Iterate, images: ImagePlanes) -> Float[Array, " batch"]:
+    """The largest coordinate of a problem's poses and target, mm."""
     away = jnp.max(images.mask * jnp.max(jnp.abs(images.origin), axis=0), axis=1)
     return jnp.maximum(away, jnp.max(jnp.abs(iterate.point), axis=0))
 
 
-def gradient_cosine(normal: Normal, vanished: Float[Array, " lanes"]) -> Float[Array, " lanes"]:
-    """max_k |g_k| / (|J_k| |r|), 0 where the residuals vanish; NaN in a lost lane."""
+def gradient_cosine(normal: Normal, vanished: Float[Array, " batch"]) -> Float[Array, " batch"]:
+    """max_k |g_k| / (|J_k| |r|), 0 where the residuals vanish; NaN where the cost is not finite."""
     length = jnp.sqrt(jnp.abs(normal.diagonal()) * normal.cost)
     cosine = jnp.max(jnp.abs(normal.gradient) / jnp.where(length > 0, length, 1.0), axis=0)
     cosine = jnp.where(jnp.isfinite(normal.cost), cosine, jnp.nan)
@@ -246,8 +246,8 @@ def gradient_cosine(normal: Normal, vanished: Float[Array, " lanes"]) -> Float[A
 
 
 def damped_step(
-    normal: Normal, damping: Float[Array, " lanes"]
-) -> tuple[Float[Array, "p lanes"], Float[Array, " lanes"], Bool[Array, " lanes"]]:
+    normal: Normal, damping: Float[Array, " batch"]
+) -> tuple[Float[Array, "p batch"], Float[Array, " batch"], Bool[Array, " batch"]]:
     """The damped step, the decrease of half the cost that it predicts, and where it is lost.
 
     A step is lost, and zero, where the matrix is not positive definite.
@@ -257,7 +257,7 @@ def damped_step(
     diagonal = jnp.where(diagonal > 0, diagonal, 1.0)
     eye = jnp.eye(len(diagonal), dtype=damping.dtype)[..., None]
     matrix, gradient = barrier((normal.stacked() + damping * diagonal * eye, normal.gradient))
-    move = barrier(dense.solve_lanes_last(matrix, -gradient))
+    move = barrier(dense.solve_batch_last(matrix, -gradient))
     lost = jnp.logical_not(jnp.isfinite(jnp.sum(move, axis=0)))
     move = jnp.where(lost, 0.0, move)
     held = damping * diagonal * move - normal.gradient
@@ -275,10 +275,10 @@ def iterate_once(
     less_exact: float = LESS_EXACT,
     exact_below: float = EXACT_BELOW,
 ) -> Descent:
-    """Evaluate every active lane's candidate, and choose the next one.
+    """Evaluate every active problem's candidate, and choose the next one.
 
     Normal equations are used at once and not stored: to evaluate a place again, where a step from
-    it has failed, is cheaper than to keep them for every lane.
+    it has failed, is cheaper than to keep them for every problem.
     """
     normal = barrier(equations(state.candidate, state.exact_next))
 
@@ -354,7 +354,7 @@ def minimise(
     max_steps: int = 100,
     trace: int = 0,
 ) -> Descent:
-    """Minimise every lane's objective.
+    """Minimise every problem's objective.
 
     Args:
         start: unknowns to start from.
@@ -367,7 +367,7 @@ def minimise(
         trace: how many values of the cost to keep.
 
     Returns:
-        Where every lane stopped.
+        Where every problem stopped.
     """
     if tolerance is None:
         tolerance = default_tolerance(images.mask.dtype)

@@ -49,7 +49,7 @@ HELD_CHANNEL_SIGMA = (0.5, 1.0)
 
 
 class Solution(eqx.Module):
-    """Where a method stopped; lanes last, except in the law and the convergence.
+    """Where a method stopped; the batch axis is last, except in the law and the convergence.
 
     Attributes:
         place: X, c and the further unknowns.
@@ -65,8 +65,8 @@ class Solution(eqx.Module):
     observation: Observation
     medium: MediumPrior | None
     convergence: Convergence
-    covariance: Float[Array, "p p lanes"] | None = None
-    elevation_sd: Float[Array, "lanes n"] | None = None
+    covariance: Float[Array, "p p batch"] | None = None
+    elevation_sd: Float[Array, "batch n"] | None = None
     law: OffsetLaw | None = None
 
 
@@ -126,7 +126,7 @@ def observe(
     held = HELD_CHANNEL_SIGMA if plan.channels else HELD_SIGMA
     dtype = images.mask.dtype
     sigma = jnp.asarray(held, dtype) if given.sigma is None else given.sigma
-    sigma = jnp.broadcast_to(sigma[:, None], (len(held), images.lanes))
+    sigma = jnp.broadcast_to(sigma[:, None], (len(held), images.batch_size))
     medium = None
     if given.medium_sd is not None and any(name in plan.blocks for name in MEDIUM):
         speed = problems.nominal_sound_speed
@@ -158,7 +158,7 @@ def run(
     observation, medium = observe(problems, images, given, plan)
     found = _descended(begun, observation, medium, images, plan)
     zero = jnp.zeros_like(found.cost)
-    floored, rounds = jnp.zeros((images.lanes, 3), bool), jnp.zeros_like(found.iterations)
+    floored, rounds = jnp.zeros((images.batch_size, 3), bool), jnp.zeros_like(found.iterations)
     if plan.self_tuning:
         assert isinstance(found, SelfTuned | Fit)
         observation = observation.with_sigma(found.updated)

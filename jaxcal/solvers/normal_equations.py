@@ -20,8 +20,8 @@ An unknown y of the image itself is eliminated inside the pass: with D = phi_yy 
 Schur complement of this image is K = phi_qq - b b' / D (the shared unknowns' part of the
 arrow-shaped system that X, c and all offsets make together; its cost is O(n p^2)).
 
-The curvature is Gauss-Newton's where a lane's ``gate`` is 0, and exact where it is 1: far from the
-optimum the exact curvature may be indefinite, and near it Gauss-Newton is slow along directions
+The curvature is Gauss-Newton's for a problem whose ``gate`` is 0, and exact where it is 1: far from
+the optimum the exact curvature may be indefinite, and near it Gauss-Newton is slow along directions
 that the data barely determine.
 
 Reference: Triggs, McLauchlan, Hartley, Fitzgibbon, "Bundle adjustment: a modern synthesis", 2000.
@@ -106,7 +106,7 @@ def _derive(
     exact: bool,
 ) -> _Derived:
     """An observation's residuals at q, with their derivatives."""
-    still = jnp.zeros((images.lanes, 1), images.mask.dtype)
+    still = jnp.zeros((images.batch_size, 1), images.mask.dtype)
     unknowns = tuple(range(RIGID_UNKNOWNS, iterate.unknowns))
     further = [still] * len(unknowns)
     direct, free = further, None
@@ -256,7 +256,7 @@ def contributions(
     turned: Matrix,
     term: Term,
     direct: tuple[int, ...],
-    gate: Float[Array, "lanes 1"] | int,
+    gate: Float[Array, "batch 1"] | int,
 ) -> tuple[Vector, Vector]:
     """An image's part of the curvature (upper triangle) and the gradient, as planes or 0.
 
@@ -338,7 +338,7 @@ def with_twist(flat: Vector, gradient: Vector, unknowns: int) -> Vector:
 
 
 class Normal(eqx.Module):
-    """The normal equations of every lane at an iterate, lanes last.
+    """The normal equations of every problem at an iterate; batch axis last.
 
     Attributes:
         curvature: upper triangle, in the order of :func:`pairs`.
@@ -348,16 +348,16 @@ class Normal(eqx.Module):
             eliminating these lowers the diagonal; None where the diagonal is |J_k|^2.
     """
 
-    curvature: Float[Array, "triangle lanes"]
-    gradient: Float[Array, "p lanes"]
-    cost: Float[Array, " lanes"]
-    squares: Float[Array, "p lanes"] | None = None
+    curvature: Float[Array, "triangle batch"]
+    gradient: Float[Array, "p batch"]
+    cost: Float[Array, " batch"]
+    squares: Float[Array, "p batch"] | None = None
 
-    def stacked(self) -> Float[Array, "p p lanes"]:
+    def stacked(self) -> Float[Array, "p p batch"]:
         """The full matrix as one array."""
         return stacked(self.curvature)
 
-    def diagonal(self) -> Float[Array, "p lanes"]:
+    def diagonal(self) -> Float[Array, "p batch"]:
         """|J_k|^2 of every unknown: what damping and the gradient cosine are relative to."""
         if self.squares is not None:
             return self.squares
@@ -365,7 +365,7 @@ class Normal(eqx.Module):
         return picked(self.curvature, np.array(places))
 
 
-def stacked(flat: Float[Array, "triangle lanes"]) -> Float[Array, "p p lanes"]:
+def stacked(flat: Float[Array, "triangle batch"]) -> Float[Array, "p p batch"]:
     """A symmetric matrix from its upper triangle."""
     return picked(flat, square_places(int((2 * flat.shape[0]) ** 0.5)))
 
@@ -379,13 +379,13 @@ def accumulate(
     iterate: Iterate,
     observation: Observation,
     images: ImagePlanes,
-    gate: Float[Array, " lanes"] | None,
+    gate: Float[Array, " batch"] | None,
     medium: MediumPrior | None = None,
 ) -> Normal:
     """One pass: the normal equations at an iterate.
 
     Args:
-        iterate: X, c and the further unknowns of every lane.
+        iterate: X, c and the further unknowns of every problem.
         observation: whose residuals.
         images: the data.
         gate: 1 for exact second derivatives, 0 for Gauss-Newton's; None for the latter everywhere.
@@ -431,11 +431,11 @@ def information_and_design(
     observation: Observation,
     images: ImagePlanes,
     medium: MediumPrior | None = None,
-) -> tuple[Float[Array, "p p lanes"], Float[Array, "p p lanes"]]:
+) -> tuple[Float[Array, "p p batch"], Float[Array, "p p batch"]]:
     """Gauss-Newton's matrix, and that of the unweighted residuals, in one pass.
 
     Args:
-        iterate: X, c and the further unknowns of every lane.
+        iterate: X, c and the further unknowns of every problem.
         observation: one without an unknown in every image.
         images: the data.
         medium: what is known of sound speed and delay beforehand.
@@ -458,7 +458,7 @@ def information_and_design(
 
 
 class ComponentSums(eqx.Module):
-    """Sums of one pass over the images for each component separately, unweighted; lanes last.
+    """Sums of one pass over the images for each component separately, unweighted; batch axis last.
 
     Attributes:
         squares: rss_k, mm^2.
@@ -468,13 +468,13 @@ class ComponentSums(eqx.Module):
         known: what is known of the medium: cost, gradient, diagonal of the curvature.
     """
 
-    squares: Float[Array, "k lanes"]
-    gradient: Float[Array, "k p lanes"]
-    matrix: Float[Array, "k triangle lanes"]
-    rest: Float[Array, "triangle lanes"]
-    known: tuple[Float[Array, " lanes"], Float[Array, "p lanes"], Float[Array, "p lanes"]] | None
+    squares: Float[Array, "k batch"]
+    gradient: Float[Array, "k p batch"]
+    matrix: Float[Array, "k triangle batch"]
+    rest: Float[Array, "triangle batch"]
+    known: tuple[Float[Array, " batch"], Float[Array, "p batch"], Float[Array, "p batch"]] | None
 
-    def weighed(self, weight: Float[Array, "k lanes"]) -> Normal:
+    def weighed(self, weight: Float[Array, "k batch"]) -> Normal:
         """Gauss-Newton's normal equations with weights 1/s_k^2."""
         flat = jnp.sum(weight[:, None] * self.matrix, axis=0)
         gradient = jnp.sum(weight[:, None] * self.gradient, axis=0)
@@ -492,13 +492,13 @@ def component_sums(
     iterate: Iterate,
     observation: Observation,
     images: ImagePlanes,
-    sigma: Float[Array, "k lanes"] | None,
+    sigma: Float[Array, "k batch"] | None,
     medium: MediumPrior | None = None,
 ) -> ComponentSums:
     """One pass that keeps the components apart.
 
     Args:
-        iterate: X, c and the further unknowns of every lane.
+        iterate: X, c and the further unknowns of every problem.
         observation: one without an unknown in every image.
         images: the data.
         sigma: SDs for the rest of the exact curvature, mm; None leaves it out.

@@ -71,12 +71,12 @@ class MeanBelief(eqx.Module):
         log_odds: ln of how much more probable the data are with a mean than without one.
     """
 
-    mean: Float[Array, "*lanes"]
-    variance: Float[Array, "*lanes"]
-    log_odds: Float[Array, "*lanes"]
+    mean: Float[Array, "*batch"]
+    variance: Float[Array, "*batch"]
+    log_odds: Float[Array, "*batch"]
 
     @property
-    def probability(self) -> Float[Array, "*lanes"]:
+    def probability(self) -> Float[Array, "*batch"]:
         """Probability that there is a mean other than zero."""
         return jax.nn.sigmoid(self.log_odds + log(PROBABILITY / (1 - PROBABILITY)))
 
@@ -111,12 +111,12 @@ def influences(
     place: Iterate,
     observation: Observation,
     images: ImagePlanes,
-    weight: Float[Array, "k lanes"],
-    mean: Float[Array, " lanes"],
+    weight: Float[Array, "k batch"],
+    mean: Float[Array, " batch"],
     *,
-    along: Float[Array, "q lanes"],
-    step: Float[Array, "q lanes"],
-) -> tuple[Float[Array, "lanes n"], Float[Array, "lanes n"]]:
+    along: Float[Array, "q batch"],
+    step: Float[Array, "q batch"],
+) -> tuple[Float[Array, "batch n"], Float[Array, "batch n"]]:
     """How far each image moves b, to first order, mm, and its share of the information about b.
 
     Args:
@@ -130,7 +130,7 @@ def influences(
     """
     q, turned = targets(place, images)
 
-    def moved(by: Float[Array, "q lanes"]) -> Vector:
+    def moved(by: Float[Array, "q batch"]) -> Vector:
         rows = [row[:, None] for row in by]
         turn = unrolled.apply(unrolled.cross(q), rows[3:6])
         shift = unrolled.apply(turned, rows[6:RIGID_UNKNOWNS])
@@ -160,10 +160,10 @@ def influences(
 
 
 def trust_in(
-    variance: Float[Array, " lanes"],
-    moved: Float[Array, "lanes n"],
-    share: Float[Array, "lanes n"],
-) -> Float[Array, " lanes"]:
+    variance: Float[Array, " batch"],
+    moved: Float[Array, "batch n"],
+    share: Float[Array, "batch n"],
+) -> Float[Array, " batch"]:
     """The variance of b under the model over the variance that the images show, at most one.
 
     Args:

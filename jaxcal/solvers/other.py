@@ -30,7 +30,7 @@ MOST_UPDATES = 60
 
 
 class Fit(eqx.Module):
-    """Where the solver stopped; lanes last.
+    """Where the solver stopped; batch axis last.
 
     Attributes:
         place: X, c and the further unknowns.
@@ -43,12 +43,12 @@ class Fit(eqx.Module):
     """
 
     place: Iterate
-    cost: Float[Array, " lanes"]
-    cosine: Float[Array, " lanes"]
-    settled: Bool[Array, " lanes"]
-    iterations: Int[Array, " lanes"]
-    updated: Float[Array, "k lanes"]
-    trace: Float[Array, "trace lanes"] | None
+    cost: Float[Array, " batch"]
+    cosine: Float[Array, " batch"]
+    settled: Bool[Array, " batch"]
+    iterations: Int[Array, " batch"]
+    updated: Float[Array, "k batch"]
+    trace: Float[Array, "trace batch"] | None
 
     @classmethod
     def of(
@@ -77,15 +77,15 @@ class Fit(eqx.Module):
 
 def whitened_residuals(
     place: Iterate, observation: Observation, images: ImagePlanes, medium: MediumPrior | None
-) -> Float[Array, "residuals lanes"]:
-    """All residuals of every lane in SDs, zeros where an image is left out; lanes last."""
+) -> Float[Array, "residuals batch"]:
+    """All residuals of every problem in SDs, zeros where an image is left out; batch axis last."""
     q, axes = targets(place, images)
     parts = []
     found = observation.components(q, Further.at(place, axes), images)
     for component, sd in zip(found, observation.sigma, strict=True):
         for error in component.errors:
             white = weight_of(component, images) * error / sd.reshape(-1, *(1,) * (error.ndim - 1))
-            parts.append(white.reshape(images.lanes, -1).T)
+            parts.append(white.reshape(images.batch_size, -1).T)
     if medium is not None:
         parts += [
             (away * jnp.sqrt(precision))[None] for _, away, precision in medium.deviations(place)
@@ -107,7 +107,7 @@ def minimise_with(
         solver: of optimistix.
         start: unknowns to start from.
         observation: the objective.
-        images: the data, of one lane.
+        images: the data, a batch of one.
         medium: what is known of sound speed and delay beforehand.
         options: with the largest number of steps and the length of the trace.
     """
@@ -138,7 +138,7 @@ def self_tuned_with(
         solver: of optimistix.
         start: the conventional fit.
         observation: the objective; its SDs are held where too few images determine them.
-        images: the data, of one lane.
+        images: the data, a batch of one.
         medium: what is known of sound speed and delay beforehand.
         options: with the largest number of steps of each solve.
     """
@@ -164,7 +164,7 @@ def self_tuned_with(
         after = solve(fit.place, sigma)
         moving = change > TOLERANCE
         moved = jnp.max(jnp.abs(jnp.log(after.updated / sigma)), axis=0)
-        # A lane that is lost (NaN) must stop, not hold up its neighbours.
+        # A problem that is lost (NaN) must stop, not hold up the others.
         moved = jnp.where(jnp.isfinite(moved), moved, 0.0)
         after, sigma, change, taken = choose(
             moving,

@@ -19,9 +19,9 @@ derivatives add to the curvature:
 
 so the SDs are updated a few times from these sums alone, the step for the new SDs is taken, and the
 next pass computes the exact sums there. Steps are accepted by the decrease of the weighted cost
-with the new SDs, and damped as in :mod:`jaxcal.solvers.levenberg_marquardt`. A lane has converged
-when, at the same place, the update no longer changes the SDs and the gradient no longer moves the
-unknowns: the fixed point of Helmert's iteration.
+with the new SDs, and damped as in :mod:`jaxcal.solvers.levenberg_marquardt`. A problem has
+converged when, at the same place, the update no longer changes the SDs and the gradient no longer
+moves the unknowns: the fixed point of Helmert's iteration.
 
 A component whose error truly vanishes (no noise, or every target in the plane) would drive its SD
 to zero and the weights to infinity. The SD is held at a thousandth of the largest one, which is as
@@ -94,8 +94,8 @@ def on_floor(sigma: Float[Array, " components ..."]) -> Bool[Array, " components
 
 
 def helmert(
-    squares: Array, leverage: Array, count: Array, sigma: Float[Array, "k lanes"]
-) -> Float[Array, "k lanes"]:
+    squares: Array, leverage: Array, count: Array, sigma: Float[Array, "k batch"]
+) -> Float[Array, "k batch"]:
     """One update of the SDs, mm, without floor.
 
     Args:
@@ -109,7 +109,7 @@ def helmert(
 
 
 class SelfTuned(eqx.Module):
-    """The state of every lane; at the end, its answer.
+    """The state of every problem; at the end, its answer.
 
     Attributes:
         place: X, c and the further unknowns.
@@ -130,33 +130,33 @@ class SelfTuned(eqx.Module):
         idle: steps in a row without a gain.
         iterations: passes.
         settled: converged, as far as rounding allows.
-        active: the lane goes on.
+        active: the problem goes on.
         trace: best cost after each of the first passes; NaN beyond the last; None: not kept.
     """
 
     place: Iterate
-    sigma: Float[Array, "k lanes"]
-    updated: Float[Array, "k lanes"]
-    cost: Float[Array, " lanes"]
-    change: Float[Array, " lanes"]
-    cosine: Float[Array, " lanes"]
+    sigma: Float[Array, "k batch"]
+    updated: Float[Array, "k batch"]
+    cost: Float[Array, " batch"]
+    change: Float[Array, " batch"]
+    cosine: Float[Array, " batch"]
     candidate: Iterate
-    proposed: Float[Array, "k lanes"]
-    units: Float[Array, "k lanes"]
-    retry: Bool[Array, " lanes"]
-    weighed: Float[Array, "k lanes"]
-    half: Float[Array, " lanes"]
-    predicted: Float[Array, " lanes"]
-    exact_used: Float[Array, " lanes"]
-    damping: Float[Array, " lanes"]
-    idle: Int[Array, " lanes"]
-    iterations: Int[Array, " lanes"]
-    settled: Bool[Array, " lanes"]
-    active: Bool[Array, " lanes"]
-    trace: Float[Array, "trace lanes"] | None
+    proposed: Float[Array, "k batch"]
+    units: Float[Array, "k batch"]
+    retry: Bool[Array, " batch"]
+    weighed: Float[Array, "k batch"]
+    half: Float[Array, " batch"]
+    predicted: Float[Array, " batch"]
+    exact_used: Float[Array, " batch"]
+    damping: Float[Array, " batch"]
+    idle: Int[Array, " batch"]
+    iterations: Int[Array, " batch"]
+    settled: Bool[Array, " batch"]
+    active: Bool[Array, " batch"]
+    trace: Float[Array, "trace batch"] | None
 
     @classmethod
-    def before(cls, start: Iterate, held: Float[Array, "k lanes"], trace: int) -> SelfTuned:
+    def before(cls, start: Iterate, held: Float[Array, "k batch"], trace: int) -> SelfTuned:
         """The state before the first pass; infinite SDs leave out exact second derivatives."""
         number = jnp.zeros_like(start.point[0])
         no, count = jnp.zeros(number.shape, bool), jnp.zeros(number.shape, jnp.int32)
@@ -199,23 +199,23 @@ class Proposal(eqx.Module):
         predicted: predicted decrease of ``half``.
     """
 
-    move: Float[Array, "p lanes"]
-    sigma: Float[Array, "k lanes"]
-    weighed: Float[Array, "k lanes"]
-    first: Float[Array, "k lanes"]
-    exact: Float[Array, " lanes"]
-    indefinite: Bool[Array, " lanes"]
-    half: Float[Array, " lanes"]
-    predicted: Float[Array, " lanes"]
+    move: Float[Array, "p batch"]
+    sigma: Float[Array, "k batch"]
+    weighed: Float[Array, "k batch"]
+    first: Float[Array, "k batch"]
+    exact: Float[Array, " batch"]
+    indefinite: Bool[Array, " batch"]
+    half: Float[Array, " batch"]
+    predicted: Float[Array, " batch"]
 
 
 def updated(
     sums: ComponentSums,
     normal: Normal,
-    sigma: Float[Array, "k lanes"],
-    move: Float[Array, "p lanes"],
-    count: Float[Array, "k lanes"],
-) -> Float[Array, "k lanes"]:
+    sigma: Float[Array, "k batch"],
+    move: Float[Array, "p batch"],
+    count: Float[Array, "k batch"],
+) -> Float[Array, "k batch"]:
     """Helmert's update after a step.
 
     Args:
@@ -228,11 +228,11 @@ def updated(
     diagonal = normal.diagonal()
     ridge = 16 * jnp.finfo(count.dtype).eps * jnp.where(diagonal > 0, diagonal, 1.0)
     eye = jnp.eye(len(diagonal), dtype=diagonal.dtype)[..., None]
-    inverse, _ = dense.inverse_lanes_last(stacked(normal.curvature) + eye * ridge)
+    inverse, _ = dense.inverse_batch_last(stacked(normal.curvature) + eye * ridge)
     places = pairs(len(diagonal))
     twice = np.array([1 if i == j else 2 for i, j in places], diagonal.dtype)[:, None]
 
-    def flat(matrix: Float[Array, "p p lanes"]) -> Float[Array, "triangle lanes"]:
+    def flat(matrix: Float[Array, "p p batch"]) -> Float[Array, "triangle batch"]:
         rows, columns = (np.array(each) for each in zip(*places, strict=True))
         return barrier(twice * matrix[rows, columns])
 
@@ -249,9 +249,9 @@ class Tuning(eqx.Module):
         observation: the objective.
         images: the data.
         medium: what is known of sound speed and delay beforehand, or None.
-        held: the SDs of lanes with too few images to estimate them, mm.
+        held: the SDs of problems with too few images to estimate them, mm.
         count: numbers of residuals.
-        enough: lanes with enough images.
+        enough: problems with enough images.
         coordinates: size of the coordinates that rounding acts on, mm.
         standing: gradient cosine at which the unknowns stand still.
         tolerance: relative change at which the SDs stand still.
@@ -261,10 +261,10 @@ class Tuning(eqx.Module):
     observation: Observation
     images: ImagePlanes
     medium: MediumPrior | None
-    held: Float[Array, "k lanes"]
-    count: Float[Array, "k lanes"]
-    enough: Bool[Array, " lanes"]
-    coordinates: Float[Array, " lanes"]
+    held: Float[Array, "k batch"]
+    count: Float[Array, "k batch"]
+    enough: Bool[Array, " batch"]
+    coordinates: Float[Array, " batch"]
     standing: float = eqx.field(static=True)
     tolerance: float = eqx.field(static=True)
     max_rounds: int = eqx.field(static=True)
@@ -360,9 +360,9 @@ class Tuning(eqx.Module):
         judged: Judged,
         found: Proposal,
         place: Iterate,
-        sigma: Float[Array, "k lanes"],
-        cost: Float[Array, " lanes"],
-        cosine: Float[Array, " lanes"],
+        sigma: Float[Array, "k batch"],
+        cost: Float[Array, " batch"],
+        cosine: Float[Array, " batch"],
     ) -> SelfTuned:
         """The state after a pass, with the best place so far and what was proposed from there."""
         accept, damping, idle = judged.accept, judged.damping, judged.idle
@@ -409,14 +409,14 @@ def self_tuned(
     max_rounds: int = 100,
     trace: int = 0,
 ) -> SelfTuned:
-    """Solve every lane, its SDs estimated by REML.
+    """Solve every problem, its SDs estimated by REML.
 
     It stops at a gradient cosine of 1e-10 and a relative change of the SDs of 1e-9 in float64, and
     at 1e-4 for both in float32.
 
     Args:
         start: a conventional fit.
-        observation: the objective; lanes with fewer than 8 used images keep its SDs.
+        observation: the objective; problems with fewer than 8 used images keep its SDs.
         images: the data.
         medium: what is known of sound speed and delay beforehand.
         max_rounds: most passes.
@@ -426,7 +426,7 @@ def self_tuned(
     enough = images.used >= MINIMUM_SELF_TUNING
     standing = default_tolerance(images.mask.dtype)
     images, observation = barrier((images.padded(), observation.padded()))
-    # Values of a lane are computed once, and not again for every image.
+    # Values of a problem are computed once, and not again for every image.
     coordinates, held, count, enough = barrier((reach(start, images), held, count, enough))
     tuning = Tuning(
         observation=observation,
@@ -450,11 +450,11 @@ def self_tuned(
 
 def update_at(
     place: Iterate,
-    sigma: Float[Array, "k lanes"],
+    sigma: Float[Array, "k batch"],
     observation: Observation,
     images: ImagePlanes,
     medium: MediumPrior | None,
-) -> tuple[Normal, Float[Array, "k lanes"]]:
+) -> tuple[Normal, Float[Array, "k batch"]]:
     """The normal equations with SDs, and the SDs after one update, at a place.
 
     Where :func:`self_tuned` stops, the gradient is zero and the update leaves the SDs as they are;

@@ -59,7 +59,7 @@ class ConventionalStart(eqx.Module):
 
     fit: Descent
     start: Iterate
-    searched: Bool[Array, " lanes"]
+    searched: Bool[Array, " batch"]
 
     @property
     def place(self) -> Iterate:
@@ -76,7 +76,7 @@ class GivenStart(eqx.Module):
     """
 
     place: Iterate
-    searched: Bool[Array, " lanes"]
+    searched: Bool[Array, " batch"]
 
     @classmethod
     def of(cls, start: Start, blocks: Blocks) -> GivenStart:
@@ -87,7 +87,7 @@ class GivenStart(eqx.Module):
 
 
 class Reduced(eqx.Module):
-    """The least-squares problem of the start with c and t eliminated; lanes last.
+    """The least-squares problem of the start with c and t eliminated; batch axis last.
 
     Half its objective is a'Qa / 2 - b'a, a = (a1, a3) in probe coordinates; points and pose origins
     are relative to their means.
@@ -107,18 +107,18 @@ class Reduced(eqx.Module):
         least: smallest share of t's diagonal entries that eliminating c and the rest of t leaves.
     """
 
-    count: Float[Array, " lanes"]
-    mean: Float[Array, "2 lanes"]
-    face: Float[Array, " lanes"]
-    centre: Float[Array, "3 lanes"]
-    matrix: Float[Array, "6 6 lanes"]
-    rhs: Float[Array, "6 lanes"]
-    squares: Float[Array, "2 lanes"]
-    turned: Float[Array, "3 6 lanes"]
-    rotation: Float[Array, "3 3 lanes"]
-    pulled: Float[Array, "3 lanes"]
-    spread: Float[Array, "3 3 lanes"]
-    least: Float[Array, " lanes"]
+    count: Float[Array, " batch"]
+    mean: Float[Array, "2 batch"]
+    face: Float[Array, " batch"]
+    centre: Float[Array, "3 batch"]
+    matrix: Float[Array, "6 6 batch"]
+    rhs: Float[Array, "6 batch"]
+    squares: Float[Array, "2 batch"]
+    turned: Float[Array, "3 6 batch"]
+    rotation: Float[Array, "3 3 batch"]
+    pulled: Float[Array, "3 batch"]
+    spread: Float[Array, "3 3 batch"]
+    least: Float[Array, " batch"]
 
     @classmethod
     def of(cls, images: ImagePlanes) -> Reduced:
@@ -142,23 +142,23 @@ class Reduced(eqx.Module):
 
         # c is the mean of B_i X p_i; then t.
         def squared(first: Array, second: Array) -> Array:
-            return dense.product_lanes_last(jnp.swapaxes(first, 0, 1), second) / count
+            return dense.product_batch_last(jnp.swapaxes(first, 0, 1), second) / count
 
         eye = jnp.eye(3, dtype=x.dtype)[..., None]
         ridge = 2e-12 + 32 * jnp.finfo(x.dtype).eps
         own = barrier(count * (1 + ridge) * eye - squared(rotation, rotation))
-        spread, _ = dense.inverse_lanes_last(own)
+        spread, _ = dense.inverse_batch_last(own)
         mixed = squared(rotation, turned)
-        follows = barrier(dense.product_lanes_last(spread, mixed))
+        follows = barrier(dense.product_batch_last(spread, mixed))
         back_from_t = jnp.swapaxes(mixed, 0, 1)
         # S (x) I: sums of squares and products of the points' coordinates.
         square = jnp.stack([jnp.stack(sums[:2]), jnp.stack(sums[1:3])])
         whole = square[:, None, :, None] * eye[None, :, None]
         matrix = whole.reshape(6, 6, -1) - squared(turned, turned)
-        matrix = barrier(matrix - dense.product_lanes_last(back_from_t, follows))
+        matrix = barrier(matrix - dense.product_batch_last(back_from_t, follows))
         pulled = parts[2, 9:]
         rhs = parts[:2, 9:].reshape(6, -1)
-        rhs = rhs + dense.product_lanes_last(jnp.swapaxes(follows, 0, 1), pulled)
+        rhs = rhs + dense.product_batch_last(jnp.swapaxes(follows, 0, 1), pulled)
         squares = jnp.stack([sums[0], sums[2]])
         left = jnp.stack([count * spread[k, k] for k in range(3)])
         return cls(
@@ -180,7 +180,7 @@ class Reduced(eqx.Module):
         """X's origin, the target and free scales by linear least squares with X's rotation held.
 
         Args:
-            lateral: its first column, (3, lanes).
+            lateral: its first column, (3, batch).
             axial: its last column.
             blocks: the free unknowns.
         """
@@ -191,10 +191,10 @@ class Reduced(eqx.Module):
             tiny = jnp.finfo(one.dtype).tiny
             scale = jnp.maximum(jnp.abs(self._scales(lateral, axial)), tiny)
         columns = jnp.concatenate([scale[0] * lateral, scale[1] * axial])
-        seen = dense.product_lanes_last(self.turned, columns)
-        pull = dense.product_lanes_last(jnp.swapaxes(self.rotation, 0, 1), seen) / self.count
-        of_mean = barrier(dense.product_lanes_last(self.spread, self.pulled + pull))
-        target = seen + dense.product_lanes_last(self.rotation, of_mean)
+        seen = dense.product_batch_last(self.turned, columns)
+        pull = dense.product_batch_last(jnp.swapaxes(self.rotation, 0, 1), seen) / self.count
+        of_mean = barrier(dense.product_batch_last(self.spread, self.pulled + pull))
+        target = seen + dense.product_batch_last(self.rotation, of_mean)
         depth = scale[1] * (self.mean[1] - self.face) + self.face
         free = {name: [TABLE[name].nominal * one] * TABLE[name].size for name in EXTRA}
         free["scale"] = [*scale]
@@ -207,11 +207,11 @@ class Reduced(eqx.Module):
             blocks,
         )
 
-    def _scales(self, lateral: Array, axial: Array) -> Float[Array, "2 lanes"]:
+    def _scales(self, lateral: Array, axial: Array) -> Float[Array, "2 batch"]:
         """The scales that fit best, given two columns of a rotation."""
         forces = [
-            dense.product_lanes_last(self.matrix[:, :3], lateral),
-            dense.product_lanes_last(self.matrix[:, 3:], axial),
+            dense.product_batch_last(self.matrix[:, :3], lateral),
+            dense.product_batch_last(self.matrix[:, 3:], axial),
         ]
         first, mixed, second = (
             jnp.sum(lateral * forces[0][:3], axis=0),
@@ -233,11 +233,11 @@ class Reduced(eqx.Module):
 
 def closed_form(
     images: ImagePlanes, blocks: Blocks
-) -> tuple[Iterate, Bool[Array, " lanes"], Reduced]:
+) -> tuple[Iterate, Bool[Array, " batch"], Reduced]:
     """The start, whether it is sound, and the sums from which it is computed."""
     sums = Reduced.of(images)
-    inverse, _ = dense.inverse_lanes_last(sums.matrix)
-    columns = barrier(dense.product_lanes_last(inverse, sums.rhs))
+    inverse, _ = dense.inverse_batch_last(sums.matrix)
+    columns = barrier(dense.product_batch_last(inverse, sums.rhs))
     left = jnp.stack([sums.squares[k // 3] * inverse[k, k] for k in range(6)])
     least = jnp.minimum(sums.least, 1 / jnp.max(left, axis=0))
     a, b = columns[:3], columns[3:]
@@ -282,12 +282,12 @@ def conventional(
     observation = InPlane.of(images)
     fit_from, empty = traced_once(fit_from, start, observation, images)
 
-    # The loop's first round starts in closed form. It has further rounds only where some lane's
+    # The loop's first round starts in closed form. It has further rounds only where some problem's
     # start was unsound, so the search costs nothing where it is not needed.
     def one_round(state: tuple) -> tuple:
         index, best = state
         cube = cubes[jnp.maximum(index - 1, 0)]
-        cube = jnp.broadcast_to(cube[..., None], (3, 3, images.lanes))
+        cube = jnp.broadcast_to(cube[..., None], (3, 3, images.batch_size))
         first = choose(index == 0, start, sums.with_rotation(cube[:, 0], cube[:, 2], blocks))
         fit = fit_from(barrier(first), observation, images)
         lower = (fit.cost < best.cost) | ~jnp.isfinite(best.cost)
@@ -300,7 +300,7 @@ def conventional(
 
     _, fit = jax.lax.while_loop(unfinished, one_round, (jnp.zeros((), jnp.int32), empty))
     if not fitted:
-        # A sound lane keeps its start, even if other lanes needed the search.
+        # A sound problem keeps its start, even if others needed the search.
         fit = replace(fit, place=choose(sound, start, fit.place))
     return ConventionalStart(fit, choose(sound, start, fit.place), jnp.logical_not(sound))
 

@@ -103,8 +103,8 @@ def experiments(
 
 
 def _grouped(values: Array) -> Array:
-    lanes = len(values)
-    group = SEGMENTED if lanes % SEGMENTED == 0 else lanes
+    trials = len(values)
+    group = SEGMENTED if trials % SEGMENTED == 0 else trials
     return values.reshape(-1, group, *values.shape[1:])
 
 
@@ -121,16 +121,16 @@ def _images(rotation: Array, origin: Array, lateral: Array, distance: Array) -> 
 
 def problems_of(images: ImagePlanes) -> Problem:
     """The images as problems with a leading axis; arrays that are not read are not computed."""
-    lanes, count = images.mask.shape
-    rotation = jnp.moveaxis(images.rotation, 0, -1).reshape(lanes, count, 3, 3)
+    trials, count = images.mask.shape
+    rotation = jnp.moveaxis(images.rotation, 0, -1).reshape(trials, count, 3, 3)
     top = jnp.concatenate([rotation, jnp.moveaxis(images.origin, 0, -1)[..., None]], axis=-1)
-    bottom = jnp.broadcast_to(jnp.asarray([0.0, 0.0, 0.0, 1.0]), (lanes, count, 1, 4))
+    bottom = jnp.broadcast_to(jnp.asarray([0.0, 0.0, 0.0, 1.0]), (trials, count, 1, 4))
     return Problem(
         poses=jnp.concatenate([top, bottom], axis=-2),
         measurements=jnp.stack([images.lateral, images.distance], axis=-1),
         mask=images.mask,
-        spacing=jnp.ones((lanes, 2)),
-        face_offset=jnp.zeros(lanes),
+        spacing=jnp.ones((trials, 2)),
+        face_offset=jnp.zeros(trials),
     )
 
 
@@ -180,7 +180,7 @@ def solve(
     )
 
 
-def _mean_squares(place: Iterate, images: ImagePlanes) -> Float[Array, "3 lanes"]:
+def _mean_squares(place: Iterate, images: ImagePlanes) -> Float[Array, "3 batch"]:
     """Mean squares of lateral error, range error and elevational offset at an estimate, mm^2."""
     q, _ = targets(place, images)
     far = jnp.sqrt(q[1] * q[1] + q[2] * q[2])
@@ -188,7 +188,7 @@ def _mean_squares(place: Iterate, images: ImagePlanes) -> Float[Array, "3 lanes"
     return jnp.stack(total([images.mask * error * error for error in errors])) / images.used
 
 
-def _precision(place: Iterate, truth: Iterate, test: ImagePlanes) -> Float[Array, " lanes"]:
+def _precision(place: Iterate, truth: Iterate, test: ImagePlanes) -> Float[Array, " batch"]:
     """Eq. 8, as :func:`jaxcal.diagnostics.metrics.reconstruction_precision`, mm.
 
     Reconstructed points are taken relative to the true target. They are near it, so that one pass
