@@ -128,7 +128,7 @@ def hindsight(begun, problems: Problem, drawn: Experiment, bounds: Array) -> Arr
                 max_rounds=rounds,
                 inner_steps=rule.inner_steps,
             )
-            return done.place, judged(done.place)
+            return done.iterate, judged(done.iterate)
 
         steps = jnp.asarray(np.diff(ROUNDS, prepend=0))
         by_rounds = jax.lax.scan(go_on, start, steps)[1]
@@ -141,7 +141,7 @@ def hindsight(begun, problems: Problem, drawn: Experiment, bounds: Array) -> Arr
             max_rounds=rule.max_rounds,
             inner_steps=rule.inner_steps,
         )
-        found = jnp.concatenate([by_rounds, judged(by_rule.place)[None]])
+        found = jnp.concatenate([by_rounds, judged(by_rule.iterate)[None]])
         return found.T.reshape(-1, count, len(ROUNDS) + 1)
 
     batch = (begun.image_to_probe, begun.point, problems, drawn.test_poses, drawn.test_points)

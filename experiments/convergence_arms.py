@@ -20,7 +20,7 @@ from jaxcal.backend import (
     Further,
     ImagePlanes,
     Iterate,
-    Normal,
+    NormalEquations,
     Observation,
     Parameters,
     accumulate,
@@ -29,8 +29,8 @@ from jaxcal.backend import (
 from jaxcal.model.observations import on_circle
 from jaxcal.solvers.alternating import bounded
 from jaxcal.solvers.levenberg_marquardt import (
+    DAMPING_DECREASE,
     EXACT_BELOW,
-    LESS,
     Descent,
     Rounding,
     gradient_cosine,
@@ -113,7 +113,7 @@ class Outcome(NamedTuple):
     def of(cls, fit: Descent) -> Outcome:
         """Of a batch of fits."""
         trace = None if fit.trace is None else fit.trace.T
-        return cls(fit.place.parameters(), fit.cost, fit.cosine, fit.iterations, trace)
+        return cls(fit.iterate.parameters(), fit.cost, fit.cosine, fit.iterations, trace)
 
 
 class Moved(NamedTuple):
@@ -236,8 +236,8 @@ def _arm(make: Callable[[Array, ImagePlanes], Observation], exact: bool) -> Call
         images, observation = images.padded(), observation.padded()
         rounding = Rounding.of(place, observation, images)
 
-        def equations(place: Iterate, gate: Array) -> Normal:
-            return accumulate(place, observation, images, gate if exact else None)
+        def equations(iterate: Iterate, newton: Array) -> NormalEquations:
+            return accumulate(iterate, observation, images, newton if exact else None)
 
         def one(state: Descent) -> Descent:
             return iterate_once(
@@ -246,7 +246,7 @@ def _arm(make: Callable[[Array, ImagePlanes], Observation], exact: bool) -> Call
                 rounding,
                 tolerance,
                 STEPS,
-                less_exact=LESS,
+                decrease_exact=DAMPING_DECREASE,
                 exact_below=EXACT_BELOW if exact else 0.0,
             )
 
@@ -271,13 +271,13 @@ def _alternation(
 ) -> Moved:
     done = same.advance(problems, starts, bound, radians, millimetres, rounds)
     return Moved(
-        done.place.parameters(), done.iterations, done.rotation_change, done.translation_change
+        done.iterate.parameters(), done.iterations, done.rotation_change, done.translation_change
     )
 
 
 def _normal(
     problems: Problem, parameters: Parameters, bound: Array
-) -> tuple[Normal, Float[Array, " batch"]]:
+) -> tuple[NormalEquations, Float[Array, " batch"]]:
     """Normal equations of the bounded problem, offsets eliminated; the cost that is rounding."""
     images = ImagePlanes.of(problems)
     place, observation = Iterate.of(parameters, RIGID), BoundedOffsets.of(bound, images)

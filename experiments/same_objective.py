@@ -197,7 +197,7 @@ def main() -> None:
 
     def segment(problems: Problem, starts: Parameters, bound: Array, rounds: Array) -> Segment:
         done = advance(problems, starts, bound, TOLERANCE, TOLERANCE, rounds)
-        return Segment(done.place.parameters(), done.cost, done.settled)
+        return Segment(done.iterate.parameters(), done.cost, done.converged)
 
     taken = jnp.zeros(count, jnp.int32)
     go_on = chunked(segment, problems, starts, per_image, taken)

@@ -13,7 +13,7 @@ from hw.bench.tank import Beam, Noise
 from hw.midplane.search import Settings
 from jaxcal import Problem
 from jaxcal.backend import RIGID, Component, Further, ImagePlanes, Observation, minimise
-from jaxcal.model.batch import whole
+from jaxcal.model.batch import pad_images
 from jaxcal.solvers.start import conventional
 
 # The engine's pieces compute in the caller's modes.
@@ -47,15 +47,15 @@ class PlacedOffsets(Observation):
 
     def padded(self) -> PlacedOffsets:
         """For images that are padded."""
-        return PlacedOffsets(self.sigma, whole(self.offset_sd))
+        return PlacedOffsets(self.sigma, pad_images(self.offset_sd))
 
 
 @jax.jit
 def _minimised(problem: Problem, offset_sd: Array, sigma: Array) -> tuple[Array, Array]:
     images = ImagePlanes.of(problem)
-    begin = conventional(images, RIGID).fit.place
+    begin = conventional(images, RIGID).fit.iterate
     given = jnp.concatenate([sigma.T, jnp.ones((1, sigma.shape[0]))])
-    found = minimise(begin, PlacedOffsets(given, offset_sd), images).place.parameters()
+    found = minimise(begin, PlacedOffsets(given, offset_sd), images).iterate.parameters()
     return found.rotation, found.translation
 
 

@@ -51,9 +51,9 @@ from jaxcal.model.residuals import (
 )
 from jaxcal.model.unknowns import RIGID, Blocks, size
 from jaxcal.solvers.general import LevenbergMarquardt, arrow_least_squares
-from jaxcal.solvers.implicit import optimum as implicit_tangent
+from jaxcal.solvers.implicit import implicit_tangent
 from jaxcal.solvers.levenberg_marquardt import minimise
-from jaxcal.solvers.normal_equations import Normal, accumulate
+from jaxcal.solvers.normal_equations import NormalEquations, accumulate
 from jaxcal.solvers.start import conventional
 
 __all__ = [
@@ -68,7 +68,7 @@ __all__ = [
     "Iterate",
     "LevenbergMarquardt",
     "LocalUnknown",
-    "Normal",
+    "NormalEquations",
     "Observation",
     "OwnCovariances",
     "Parameters",
@@ -112,5 +112,5 @@ def initial_fit(problem: Problem, blocks: Blocks = RIGID) -> Parameters:
 @partial(jax.jit, static_argnums=1)
 def _initial_fit(problem: Problem, blocks: Blocks) -> Parameters:
     images = ImagePlanes.of(jax.tree.map(lambda leaf: leaf[None], problem))
-    found = conventional(images, blocks).fit.place.parameters()
+    found = conventional(images, blocks).fit.iterate.parameters()
     return jax.tree.map(lambda leaf: leaf[0], found)

@@ -26,7 +26,14 @@ from jaxcal.solvers.auto import Answers, median, weights
 from jaxcal.solvers.dense import inverse_batch_last
 from jaxcal.solvers.expectation_propagation import Marginal, Sites
 from jaxcal.solvers.expectation_propagation import propagate as propagate_batch_last
-from jaxcal.solvers.offset_mean import LAGS, MEAN_SD, PROBABILITY, believed, gained, trust_in
+from jaxcal.solvers.offset_mean import (
+    LAGS,
+    MEAN_SD,
+    PROBABILITY,
+    log_evidence_gain,
+    mean_belief,
+    trust_in,
+)
 
 DENSITY = {
     "uniform": uniform(-(3**0.5), 2 * 3**0.5).pdf,
@@ -241,7 +248,7 @@ def test_the_median_is_where_the_expected_distance_is_least():
     np.testing.assert_allclose(found, means[:, 1] * [1, 0])
 
 
-believed_of = jax.jit(believed)
+believed_of = jax.jit(mean_belief)
 
 
 @pytest.mark.parametrize("trust", [1.0, 0.3])
@@ -273,7 +280,7 @@ def test_the_belief_about_the_mean_is_the_mixtures(trust):
         square = share * moment(2) / with_it
         assert float(found.variance) == pytest.approx(square - expected**2, rel=1e-6)
         gain = np.log(PROBABILITY + (1 - PROBABILITY) * without / with_it)
-        assert float(gained(found)) == pytest.approx(gain, abs=1e-6)
+        assert float(log_evidence_gain(found)) == pytest.approx(gain, abs=1e-6)
 
 
 def test_trust_falls_with_heavy_tails_and_with_errors_alike_in_successive_images():

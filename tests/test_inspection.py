@@ -75,7 +75,7 @@ def scores():
     def fit(errors):
         start, data = jax.vmap(drawn)(errors)
         images, sigma = ImagePlanes.of(data), jnp.tile(SIGMA[:, None], len(errors))
-        return minimise(Iterate.of(start, RIGID), Points(sigma), images).place.parameters(), data
+        return minimise(Iterate.of(start, RIGID), Points(sigma), images).iterate.parameters(), data
 
     def run(errors):
         parameters, data = jax.tree.map(np.asarray, fit(errors))

@@ -33,7 +33,7 @@ from jaxcal.model.observations import (
     local_unknowns,
 )
 from jaxcal.model.parameters import Parameters
-from jaxcal.model.unknowns import EXTRA, RIGID
+from jaxcal.model.unknowns import FURTHER, RIGID
 from jaxcal.solvers.levenberg_marquardt import (
     Descent,
     Rounding,
@@ -121,15 +121,15 @@ class OnLine(Observation):
     oriented: ClassVar[bool] = True
 
     def components(self, q, further, images):
-        assert further.axes is not None
+        assert further.tracker_to_image is not None
         lateral, distance = further.points(images)
-        along = unrolled.apply(further.axes, [*self.direction])
+        along = unrolled.apply(further.tracker_to_image, [*self.direction])
         crossing = [q[k] - q[1] / along[1] * along[k] for k in (0, 2)]
         return [Component([crossing[0] - lateral]), Component([crossing[1] - distance])]
 
 
 CASES = {
-    "points": (lambda images: Points(SIGMA), RIGID + EXTRA),
+    "points": (lambda images: Points(SIGMA), RIGID + FURTHER),
     "own covariances": (
         lambda images: OwnCovariances(SIGMA, shapes(), SIGMA[1] / SIGMA[0]),
         (*RIGID, "scale"),
@@ -150,7 +150,7 @@ CASES = {
     ),
     "bounded offsets": (
         lambda images: BoundedOffsets.of(jnp.full((PROBLEMS, IMAGES), 1.2), images),
-        RIGID + EXTRA,
+        RIGID + FURTHER,
     ),
     "on a line": (lambda images: OnLine(SIGMA[:2], DIRECTIONS), (*RIGID, "scale", "delay")),
     "channels": (lambda images: ChannelDistances(SIGMA[1:]), (*RIGID, "sound-speed", "delay")),
@@ -173,7 +173,7 @@ def whitened(step, local, place: Iterate, observation, images: ImagePlanes, medi
     """All whitened residuals of every problem after a step, (batch, n, residuals of an image)."""
     moved = place.moved(list(step))
     q, axes = targets(moved, images)
-    still = [jnp.zeros((PROBLEMS, 1))] * moved.extras.shape[0]
+    still = [jnp.zeros((PROBLEMS, 1))] * moved.further_values.shape[0]
     further = Further.of(moved, still, axes)
     if local is None:
         parts = observation.components(q, further, images)
@@ -186,7 +186,7 @@ def whitened(step, local, place: Iterate, observation, images: ImagePlanes, medi
             wide = (present * error).reshape(PROBLEMS, IMAGES, -1)
             found.append(images.mask[..., None] * wide / sd[:, None, None])
     if medium is not None:
-        speed, delay = moved.extra("sound-speed"), moved.extra("delay")
+        speed, delay = moved.further("sound-speed"), moved.further("delay")
         known = jnp.stack([jnp.log(speed[0]), delay[0]]) / medium.sd
         found.append(jnp.zeros((PROBLEMS, IMAGES, 2)).at[:, 0].set(known.T))
     return jnp.concatenate(found, axis=-1)
@@ -219,7 +219,7 @@ def dense(place: Iterate, observation, images: ImagePlanes, medium):
     local = None
     if isinstance(observation, LocalUnknown):
         q, _ = targets(place, images)
-        still = [jnp.zeros((PROBLEMS, 1))] * place.extras.shape[0]
+        still = [jnp.zeros((PROBLEMS, 1))] * place.further_values.shape[0]
         local, free = observation.local(q, Further.of(place, still), images)
     (half, gradient), (_, exact) = along(lambda at: slopes(at, local), zero)
     _, jacobian = along(lambda at: residuals(at, local), zero)
@@ -284,7 +284,7 @@ def test_components_apart_come_to_the_whole(drawn, name):
     @jax.jit
     def apart():
         sums = component_sums(place, observation, images, observation.sigma, medium)
-        return sums, sums.weighed(1 / observation.sigma**2)
+        return sums, sums.weighted(1 / observation.sigma**2)
 
     sums, weighed = jax.tree.map(np.asarray, apart())
     exact, newton = (
@@ -414,7 +414,7 @@ def test_offsets_are_the_closest_points_of_the_circles(drawn):
 
     @jax.jit
     def looked_at():
-        still = [jnp.zeros((PROBLEMS, 1))] * place.extras.shape[0]
+        still = [jnp.zeros((PROBLEMS, 1))] * place.further_values.shape[0]
         distance = Further.of(place, still).points(images)[1]
         return local_unknowns(place, observation, images), targets(place, images)[0], distance
 
@@ -458,14 +458,14 @@ def test_where_the_last_step_was_not_looked_at_the_gradient_is_gone_too(descent)
     normal, gated = (sums_of(place, observation, images, gate) for gate in (None, 0 * GATE))
     for one, other in zip(jax.tree.leaves(normal), jax.tree.leaves(gated), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12 * np.abs(one).max())
-    normal = sums_of(found.place, observation, images, None)
+    normal = sums_of(found.iterate, observation, images, None)
 
     @jax.jit
     def cosine():
-        rounding = Rounding.of(found.place, observation, images)
+        rounding = Rounding.of(found.iterate, observation, images)
         return gradient_cosine(normal, rounding.vanished)
 
-    assert np.all(found.settled)
+    assert np.all(found.converged)
     assert not np.any(found.active)
     assert np.all(found.cosine <= 1e-10)
     assert np.all(np.asarray(cosine()) <= 1e-10)
@@ -514,4 +514,4 @@ def test_a_step_that_fails_is_tried_again_with_more_damping(drawn):
         assert np.all(state.cost[taken] <= before.cost[taken] * (1 + 1e-9))
         failed += int(np.sum(state.retry & state.active))
     assert failed > 0
-    assert np.all(state.settled)
+    assert np.all(state.converged)

@@ -126,7 +126,7 @@ class Minimiser:
             start = jax.vmap(Parameters.of)(matrix[:, :3, :3], matrix[:, :3, 3], point)
             points = Points(jnp.tile(jnp.asarray(SIGMA_MM)[:, None], size))
             fit = minimise(Iterate.of(start, RIGID), points, ImagePlanes.of(problems))
-            found = fit.place.parameters()
+            found = fit.iterate.parameters()
             return jax.vmap(Parameters.matrix)(found), found.point, fit.iterations
 
         def whole(*parts):

@@ -30,7 +30,7 @@ from jaxcal.model.batch import ImagePlanes, Iterate, barrier, targets
 from jaxcal.model.distributions import OffsetLaw
 from jaxcal.model.parameters import Parameters
 from jaxcal.model.thresholds import LARGEST_ELEVATION, MINIMUM_SELF_TUNING
-from jaxcal.model.unknowns import EXTRA, TABLE, Blocks, block_slice, measured, size
+from jaxcal.model.unknowns import FURTHER, TABLE, Blocks, block_slice, measured, size
 from jaxcal.result.calibration import Calibration, Linearisation, Medium, Status
 from jaxcal.solvers.convergence import Convergence
 from jaxcal.solvers.dense import inverse_batch_last
@@ -178,7 +178,7 @@ def assemble(
 
 def _further(parameters: Parameters, blocks: Blocks) -> Float[Array, "*batch k"] | None:
     """The free ones of the further unknowns, in one array; None where there are none."""
-    free = [parameters.further(name) for name in EXTRA if name in blocks]
+    free = [parameters.further(name) for name in FURTHER if name in blocks]
     return jnp.concatenate(free, axis=-1) if free else None
 
 
@@ -204,7 +204,7 @@ class Errors(eqx.Module):
         q, _ = targets(Iterate.of(parameters, blocks), images)
         further = {
             name: [values[..., k, None] for k in range(TABLE[name].size)]
-            for name, values in ((name, parameters.further(name)) for name in EXTRA)
+            for name, values in ((name, parameters.further(name)) for name in FURTHER)
         }
         lateral, distance = measured(images.lateral, images.axial, images.face[:, None], further)
         # The range has no derivative at 0, and an image left out may put the target there.

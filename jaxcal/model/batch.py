@@ -20,7 +20,7 @@ from jaxcal import InputError
 from jaxcal.data.problem import Problem
 from jaxcal.model import unrolled
 from jaxcal.model.parameters import Parameters
-from jaxcal.model.unknowns import EXTRA, Blocks, block_slice, size, step_between, stepped
+from jaxcal.model.unknowns import FURTHER, Blocks, block_slice, size, step_between, stepped
 from jaxcal.model.unrolled import Matrix, Vector
 
 _CROSS_PLACES = np.array([[0, 2, 1], [2, 0, 0], [1, 0, 0]])
@@ -124,12 +124,12 @@ class ImagePlanes(eqx.Module):
         """With unused images added up to whole vectors, so that loops have no remainder."""
         if self.channels is not None:
             return self
-        added = whole(self.mask).shape[1] - self.mask.shape[1]
+        added = pad_images(self.mask).shape[1] - self.mask.shape[1]
         return ImagePlanes(
-            whole(self.rotation),
-            whole(self.origin),
-            whole(self.lateral),
-            whole(self.axial),
+            pad_images(self.rotation),
+            pad_images(self.origin),
+            pad_images(self.lateral),
+            pad_images(self.axial),
             self.face,
             jnp.pad(self.mask, [(0, 0), (0, added)]),
         )
@@ -158,14 +158,14 @@ class Iterate(eqx.Module):
         rotation: of X.
         translation: of X, mm.
         point: c, mm.
-        extras: components of the free further unknowns, in the order of the blocks.
+        further_values: components of the free further unknowns, in the order of the blocks.
         blocks: which unknowns are free (static).
     """
 
     rotation: Float[Array, "3 3 batch"]
     translation: Float[Array, "3 batch"]
     point: Float[Array, "3 batch"]
-    extras: Float[Array, "extras batch"]
+    further_values: Float[Array, "further batch"]
     blocks: Blocks = eqx.field(static=True)
 
     @classmethod
@@ -181,28 +181,28 @@ class Iterate(eqx.Module):
                 f"target of these has the shape {parameters.point.shape}"
             )
         none = jnp.zeros((0, parameters.point.shape[0]), parameters.point.dtype)
-        free = [parameters.further(name).T for name in EXTRA if name in blocks]
-        extras = jnp.concatenate([none, *free])
+        free = [parameters.further(name).T for name in FURTHER if name in blocks]
+        values = jnp.concatenate([none, *free])
         rotation = jnp.moveaxis(parameters.rotation, 0, -1)
-        return cls(rotation, parameters.translation.T, parameters.point.T, extras, blocks)
+        return cls(rotation, parameters.translation.T, parameters.point.T, values, blocks)
 
     @property
     def unknowns(self) -> int:
         """Number of unknowns of one problem."""
         return size(self.blocks)
 
-    def extra(self, name: str) -> Float[Array, "k batch"] | None:
+    def further(self, name: str) -> Float[Array, "k batch"] | None:
         """The values of a further unknown, or None where it is not free."""
         if name not in self.blocks:
             return None
         at = block_slice(self.blocks, name)
-        return self.extras[at.start - RIGID_UNKNOWNS : at.stop - RIGID_UNKNOWNS]
+        return self.further_values[at.start - RIGID_UNKNOWNS : at.stop - RIGID_UNKNOWNS]
 
     def parameters(self) -> Parameters:
         """The parameters, with a leading axis; what is not free is nominal."""
         rotation = jnp.moveaxis(self.rotation, -1, 0)
         found = jax.vmap(Parameters.of)(rotation, self.translation.T, self.point.T)
-        free = {name: self.extra(name) for name in EXTRA}
+        free = {name: self.further(name) for name in FURTHER}
         return found.with_further(
             {name: value.T for name, value in free.items() if value is not None}
         )
@@ -214,20 +214,20 @@ class Iterate(eqx.Module):
         """
         if isinstance(step, list):
             step = jnp.stack(step)
-        extras = self.extras
+        values = self.further_values
         if self.unknowns > RIGID_UNKNOWNS:
             at = RIGID_UNKNOWNS
             parts = []
-            for value, name in zip(extras, _extra_names(self.blocks), strict=True):
+            for value, name in zip(values, _further_names(self.blocks), strict=True):
                 parts.append(stepped(name, value, step[at], jnp.exp))
                 at += 1
-            extras = jnp.stack(parts)
+            values = jnp.stack(parts)
         turn = _cayley(step[3:6])
         return Iterate(
             jnp.sum(self.rotation[:, :, None] * turn, axis=1),
             self.translation + jnp.sum(self.rotation * step[:3], axis=1),
             self.point + step[6:RIGID_UNKNOWNS],
-            extras,
+            values,
             self.blocks,
         )
 
@@ -241,8 +241,8 @@ class Iterate(eqx.Module):
         along = jnp.sum(back * (other.translation - self.translation), axis=1)
         parts = [along, 2 * axis / (1 + turn[0, 0] + turn[1, 1] + turn[2, 2])]
         parts.append(other.point - self.point)
-        names = _extra_names(self.blocks)
-        for here, there, name in zip(self.extras, other.extras, names, strict=True):
+        names = _further_names(self.blocks)
+        for here, there, name in zip(self.further_values, other.further_values, names, strict=True):
             parts.append(step_between(name, here, there, jnp.log)[None])
         return jnp.concatenate(parts)
 
@@ -264,9 +264,9 @@ def picked(array: Float[Array, "k ..."], places: np.ndarray) -> Float[Array, "*p
     return array.at[places.astype(np.uint32)].get(mode="promise_in_bounds")
 
 
-def _extra_names(blocks: Blocks) -> list[str]:
+def _further_names(blocks: Blocks) -> list[str]:
     """The block of every further unknown, in order."""
-    return [name for name in EXTRA if name in blocks for _ in range(size((name,)))]
+    return [name for name in FURTHER if name in blocks for _ in range(size((name,)))]
 
 
 @jax.jit
@@ -328,7 +328,7 @@ def total(planes: Vector) -> Vector:
     return [zero if unrolled.is_zero(plane) else next(found) for plane in planes]
 
 
-def whole(planes: Float[Array, "*planes n"]) -> Float[Array, "*planes padded"]:
+def pad_images(planes: Float[Array, "*planes n"]) -> Float[Array, "*planes padded"]:
     """Planes padded with their last image, up to whole vectors of 64 bytes."""
     extra = -planes.shape[-1] % (64 // planes.dtype.itemsize)
     return jnp.pad(planes, [(0, 0)] * (planes.ndim - 1) + [(0, extra)], mode="edge")

@@ -35,16 +35,16 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxcal import InputError
-from jaxcal.model.batch import RIGID_UNKNOWNS, ImagePlanes, Iterate, targets, whole
+from jaxcal.model.batch import RIGID_UNKNOWNS, ImagePlanes, Iterate, pad_images, targets
 from jaxcal.model.thresholds import LARGEST_ELEVATION
 from jaxcal.model.unknowns import (
-    EXTRA,
+    FURTHER,
     MEDIUM,
     TABLE,
     Blocks,
     block_slice,
-    heard,
     measured,
+    predicted_distance,
     step_between,
     stepped,
 )
@@ -56,23 +56,26 @@ TRACKER_STEPS = 4
 
 
 class Further(eqx.Module):
-    """What an image sees beside q: the free further unknowns, and where the tracker's axes point.
+    """What residuals may depend on beside q: the free further unknowns, and the rotation M_i.
 
     Attributes:
         values: by name (:mod:`jaxcal.model.unknowns`), a plane (batch, 1) for each component.
-        axes: M_i = R' R_i', which turns directions in the tracker's frame into the image's; it
-            may be None where no observation is :attr:`Observation.oriented`.
+        tracker_to_image: M_i = R' R_i', the rotation of directions from the tracker's frame to the
+            image's, three rows of three planes (batch, n); None unless the observation is
+            :attr:`Observation.oriented`.
     """
 
     values: dict[str, Vector]
-    axes: Matrix | None = None
+    tracker_to_image: Matrix | None = None
 
     @classmethod
-    def of(cls, iterate: Iterate, tangent: Vector, axes: Matrix | None = None) -> Further:
+    def of(
+        cls, iterate: Iterate, tangent: Vector, tracker_to_image: Matrix | None = None
+    ) -> Further:
         """The iterate's further unknowns, moved by a step, and the tracker's axes."""
         values = {}
-        for name in EXTRA:
-            components = iterate.extra(name)
+        for name in FURTHER:
+            components = iterate.further(name)
             if components is not None:
                 at = block_slice(iterate.blocks, name)
                 steps = tangent[at.start - RIGID_UNKNOWNS : at.stop - RIGID_UNKNOWNS]
@@ -80,22 +83,22 @@ class Further(eqx.Module):
                     stepped(name, value[:, None], step, jnp.exp)
                     for value, step in zip(components, steps, strict=True)
                 ]
-        return cls(values, axes)
+        return cls(values, tracker_to_image)
 
     @classmethod
-    def at(cls, iterate: Iterate, axes: Matrix | None = None) -> Further:
+    def at(cls, iterate: Iterate, tracker_to_image: Matrix | None = None) -> Further:
         """The iterate's further unknowns as they are."""
         still = jnp.zeros_like(iterate.point[0])[:, None]
-        return cls.of(iterate, [still] * iterate.extras.shape[0], axes)
+        return cls.of(iterate, [still] * iterate.further_values.shape[0], tracker_to_image)
 
     def points(self, images: ImagePlanes) -> tuple[Array, Array]:
         """Lateral position and range of every image, mm."""
         return measured(images.lateral, images.axial, images.face[:, None], self.values)
 
-    def heard(self, distance: Array) -> Array:
-        """What elements measure of targets at distances (batch, n, elements), mm."""
+    def predicted_distance(self, distance: Array) -> Array:
+        """What elements would measure of targets at distances (batch, n, elements), mm."""
         planes = {name: [v[..., None] for v in value] for name, value in self.values.items()}
-        return heard(distance, planes)
+        return predicted_distance(distance, planes)
 
 
 class Component(eqx.Module):
@@ -276,7 +279,7 @@ class OwnCovariances(Observation):
         return InPlane.of(images)
 
     def padded(self) -> OwnCovariances:
-        return eqx.tree_at(lambda o: o.shape, self, whole(self.shape))
+        return eqx.tree_at(lambda o: o.shape, self, pad_images(self.shape))
 
 
 def variance_planes(covariance: Float[Array, "batch n 2 2"]) -> Float[Array, "3 batch n"]:
@@ -322,7 +325,7 @@ class ChannelDistances(Observation):
         square = 0.0
         for value, element in zip(q, channels.elements, strict=True):
             square = square + (value[..., None] - element[:, None, :]) ** 2
-        exact = further.heard(jnp.sqrt(square))
+        exact = further.predicted_distance(jnp.sqrt(square))
         return [Component([exact - channels.distances], channels.heard), Component([q[1]])]
 
     def count(self, images: ImagePlanes) -> Float[Array, "2 batch"]:
@@ -383,7 +386,7 @@ class HeldOffsets(Observation):
 
     def padded(self) -> HeldOffsets:
         # A padded image's range is that of the last one, and so is its offset.
-        return eqx.tree_at(lambda o: o.offset, self, whole(self.offset))
+        return eqx.tree_at(lambda o: o.offset, self, pad_images(self.offset))
 
 
 class LocalUnknown(Observation):
@@ -410,8 +413,8 @@ def local_unknowns(
     iterate: Iterate, observation: LocalUnknown, images: ImagePlanes
 ) -> Float[Array, "batch n"]:
     """Every image's own unknown at its best; 0 for images left out."""
-    q, axes = targets(iterate, images)
-    return images.mask * observation.local(q, Further.at(iterate, axes), images)[0]
+    q, tracker_to_image = targets(iterate, images)
+    return images.mask * observation.local(q, Further.at(iterate, tracker_to_image), images)[0]
 
 
 class BoundedOffsets(LocalUnknown):
@@ -461,7 +464,7 @@ class BoundedOffsets(LocalUnknown):
         return [Component(on_circle(q, local, further, images))]
 
     def padded(self) -> BoundedOffsets:
-        return eqx.tree_at(lambda o: o.bound, self, whole(self.bound))
+        return eqx.tree_at(lambda o: o.bound, self, pad_images(self.bound))
 
 
 class TrackedPoints(LocalUnknown):
@@ -536,14 +539,14 @@ class TrackedPoints(LocalUnknown):
     def padded(self) -> TrackedPoints:
         if self.shape is None:
             return self
-        return eqx.tree_at(lambda o: o.shape, self, whole(self.shape))
+        return eqx.tree_at(lambda o: o.shape, self, pad_images(self.shape))
 
 
 class MediumPrior(eqx.Module):
-    """What is known of sound speed and delay before the data are seen.
+    """The prior of sound speed and delay: Gaussian, about their nominal values.
 
     Attributes:
-        sd: of the sound speed (relative) and of the delay (mm) about their nominal values.
+        sd: prior SDs of the sound speed (relative) and of the delay (mm).
         blocks: the free unknowns (static).
     """
 
@@ -558,7 +561,7 @@ class MediumPrior(eqx.Module):
         """Index, deviation from nominal and precision of sound speed and delay, where free."""
         found = []
         for name, sd in zip(MEDIUM, self.sd, strict=True):
-            value = iterate.extra(name)
+            value = iterate.further(name)
             if value is not None:
                 away = step_between(name, TABLE[name].nominal, value[0], jnp.log)
                 found.append((block_slice(self.blocks, name).start, away, 1 / (sd * sd)))

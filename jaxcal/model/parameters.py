@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from jaxcal import InputError
 from jaxcal.data.geometry import matrix_from_rotation, rotation_from_vector
-from jaxcal.model.unknowns import EXTRA, TABLE, Blocks, block_slice, size, stepped
+from jaxcal.model.unknowns import FURTHER, TABLE, Blocks, block_slice, size, stepped
 
 
 class Parameters(eqx.Module):
@@ -102,7 +102,7 @@ def retract(parameters: Parameters, tangent: Float[Array, " p"], blocks: Blocks)
     return moved.with_further(
         {
             name: stepped(name, parameters.further(name), part(name), jnp.exp)
-            for name in EXTRA
+            for name in FURTHER
             if name in blocks
         }
     )

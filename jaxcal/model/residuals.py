@@ -16,7 +16,7 @@ from jaxcal.data.problem import Problem
 from jaxcal.model.batch import ImagePlanes, Iterate, targets
 from jaxcal.model.observations import ChannelDistances, Further, Points, on_circle
 from jaxcal.model.parameters import Parameters
-from jaxcal.model.unknowns import EXTRA, RIGID
+from jaxcal.model.unknowns import FURTHER, RIGID
 
 
 def _batch_of_one(
@@ -25,7 +25,7 @@ def _batch_of_one(
     """The images, the further unknowns and q of one problem, as planes of a batch of one."""
     alone = jax.tree.map(lambda leaf: leaf[None], (parameters, problem))
     images = ImagePlanes.of(alone[1], channels=channels)
-    iterate = Iterate.of(alone[0], RIGID + EXTRA)
+    iterate = Iterate.of(alone[0], RIGID + FURTHER)
     return images, Further.at(iterate), targets(iterate, images)[0]
 
 

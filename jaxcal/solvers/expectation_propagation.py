@@ -50,7 +50,7 @@ from jaxcal.model.shapes import Family, Moments, tilted
 from jaxcal.model.unrolled import Matrix, Vector
 from jaxcal.runtime.compiler import traced_once
 from jaxcal.solvers import dense
-from jaxcal.solvers.normal_equations import pairs, square_places, stacked
+from jaxcal.solvers.normal_equations import V_Y, pairs, square_places, stacked
 
 SWEEPS = 3
 """Sweeps under each law, from the sites of the law before; a family's first gets twice as many."""
@@ -60,15 +60,13 @@ DAMPING = 0.8
 LEAST_ROOM = 1e-3
 """Least 1 - tau_i v_i: at zero, the belief without site i is no Gaussian any more."""
 
-SEEN = (1, 3, 5, 6, 7, 8)
+SITE_UNKNOWNS = (V_Y, 3, 5, 6, 7, 8)
 """v_y (as s), w_x, w_z and d: the unknowns on which the sites depend."""
 
-ELEVATION = SEEN[0]
-
-TRIANGLE = pairs(len(SEEN))
+TRIANGLE = pairs(len(SITE_UNKNOWNS))
 
 
-def hidden(unknowns: int) -> list[int]:
+def eliminated(unknowns: int) -> list[int]:
     """The unknowns that z leaves out: v_x, v_z, w_y, the further unknowns and, last of all, b."""
     return [0, 2, 4, *range(RIGID_UNKNOWNS, unknowns + 1)]
 
@@ -94,7 +92,7 @@ class Sites(eqx.Module):
     def of(
         cls,
         q: Vector,
-        turned: Matrix,
+        tracker_to_image: Matrix,
         used: Float[Array, "batch n"],
         mean: Float[Array, " batch"],
         bound: Float[Array, "batch n"] | None,
@@ -102,7 +100,7 @@ class Sites(eqx.Module):
         """From q_i and M_i, about a mean b of the offsets, within bounds on |q_iy|."""
         about = mean[:, None]
         lower, upper = (None, None) if bound is None else (-bound - about, bound - about)
-        direction = [jnp.full_like(q[1], -1.0), q[2], -q[0], *turned[1]]
+        direction = [jnp.full_like(q[1], -1.0), q[2], -q[0], *tracker_to_image[1]]
         return cls(direction, q[1] - about, used, lower, upper)
 
     @jax.jit
@@ -125,7 +123,7 @@ class Marginal(eqx.Module):
     Attributes:
         information: of z.
         gradient: of the log likelihood at z = 0.
-        shift: the others (:func:`hidden`) at z = 0.
+        shift: the others (:func:`eliminated`) at z = 0.
         slope: rows B of others = shift + B z.
         spread: their covariance for given z.
     """
@@ -138,20 +136,20 @@ class Marginal(eqx.Module):
 
     def lift(self) -> Lift:
         """How all unknowns, b last, follow from z."""
-        eye = jnp.eye(len(SEEN), dtype=self.gradient.dtype)[..., None]
-        seen = jnp.broadcast_to(eye, (len(SEEN), *self.gradient.shape))
+        eye = jnp.eye(len(SITE_UNKNOWNS), dtype=self.gradient.dtype)[..., None]
+        seen = jnp.broadcast_to(eye, (len(SITE_UNKNOWNS), *self.gradient.shape))
         shift = jnp.concatenate([self.shift, jnp.zeros_like(self.gradient)])
         slope = jnp.concatenate([self.slope, seen])
-        spread = jnp.pad(self.spread, [(0, len(SEEN)), (0, len(SEEN)), (0, 0)])
-        order = [*hidden(len(shift) - 1), *SEEN]
+        spread = jnp.pad(self.spread, [(0, len(SITE_UNKNOWNS)), (0, len(SITE_UNKNOWNS)), (0, 0)])
+        order = [*eliminated(len(shift) - 1), *SITE_UNKNOWNS]
         back = np.argsort(order)
         whole = jnp.concatenate([shift[:, None], slope, spread], axis=1)[back]
         # From s back to v_y = s - b.
-        whole = whole - (np.arange(len(back)) == ELEVATION)[:, None, None] * whole[-1]
-        spread = whole[:, 1 + len(SEEN) :][:, back]
-        sheared = (np.arange(len(back)) == ELEVATION)[None, :, None]
+        whole = whole - (np.arange(len(back)) == V_Y)[:, None, None] * whole[-1]
+        spread = whole[:, 1 + len(SITE_UNKNOWNS) :][:, back]
+        sheared = (np.arange(len(back)) == V_Y)[None, :, None]
         spread = spread - sheared * spread[:, -1, None]
-        return barrier(Lift(whole[:, 0], whole[:, 1 : 1 + len(SEEN)], spread))
+        return barrier(Lift(whole[:, 0], whole[:, 1 : 1 + len(SITE_UNKNOWNS)], spread))
 
 
 class Lift(eqx.Module):
@@ -184,7 +182,7 @@ def marginal(
     precision: Float[Array, " batch"],
     mean: Float[Array, " batch"],
 ) -> Marginal:
-    """Eliminate the unknowns that z leaves out (:func:`hidden`).
+    """Eliminate the unknowns that z leaves out (:func:`eliminated`).
 
     Args:
         information: of X, the target and the further unknowns in the measurements, upper triangle.
@@ -194,9 +192,9 @@ def marginal(
     """
     unknowns = gradient.shape[0]
     # With v_y = s - b, b has the rows and columns of v_y, with the opposite sign.
-    order = np.array([*hidden(unknowns), *SEEN])
+    order = np.array([*eliminated(unknowns), *SITE_UNKNOWNS])
     is_mean = order == unknowns
-    from_flat = np.where(is_mean, ELEVATION, order)
+    from_flat = np.where(is_mean, V_Y, order)
     places = square_places(unknowns)[np.ix_(from_flat, from_flat)]
     sign = np.where(is_mean, -1, 1).astype(information.dtype)
     last = is_mean[:, None, None] & is_mean[:, None]
@@ -204,7 +202,7 @@ def marginal(
     full = full + jnp.where(last, precision, 0.0)
     force = -picked(gradient, from_flat) * sign[:, None]
     force = force - jnp.where(is_mean[:, None], precision * mean, 0.0)
-    count = len(order) - len(SEEN)
+    count = len(order) - len(SITE_UNKNOWNS)
     own, mixed, left = barrier((full[:count, :count], full[:count, count:], full[count:, count:]))
     spread, _ = dense.inverse_batch_last(own)
     slope = barrier(-dense.product_batch_last(spread, mixed))
@@ -322,11 +320,11 @@ class _Found(eqx.Module):
     change: Float[Array, " batch"]
 
 
-def seen(
+def site_part(
     squares: Float[Array, "triangle batch"], pull: Float[Array, "p batch"]
 ) -> tuple[Float[Array, "6 6 batch"], Float[Array, "6 batch"]]:
     """The parts for z of sums of h_i h_i' (upper triangle) and h_i o_i over all unknowns."""
-    at = np.array(SEEN)
+    at = np.array(SITE_UNKNOWNS)
     return picked(squares, square_places(pull.shape[0])[np.ix_(at, at)]), picked(pull, at)
 
 
@@ -369,12 +367,12 @@ class _Laws(eqx.Module):
 
         def sweep(_: Array, carry: tuple) -> tuple:
             before, _ = carry
-            after, evidence, crowded = self.sweep(family, sd, before)
+            after, evidence, dominated = self.sweep(family, sd, before)
             step = after.belief.mean - before.belief.mean
             length = jnp.sum(
                 step * dense.product_batch_last(after.belief.information, step), axis=0
             )
-            change = jnp.where(crowded, jnp.inf, jnp.sqrt(jnp.maximum(length, 0.0)))
+            change = jnp.where(dominated, jnp.inf, jnp.sqrt(jnp.maximum(length, 0.0)))
             return after, (evidence, change)
 
         none = jnp.zeros_like(sd)
@@ -404,23 +402,23 @@ class _Laws(eqx.Module):
         site = found.fall + jnp.log(found.mass * jnp.sqrt(joined))
         site = site - 0.5 * ((centre + without * nu) ** 2 / joined - centre**2) / without
         site = site + nu * offset - 0.5 * tau * offset**2
-        crowded = jnp.where(tau * without > 0.99 / LEAST_ROOM, used, 0.0)
+        dominated = jnp.where(tau * without > 0.99 / LEAST_ROOM, used, 0.0)
 
         new_tau, new_nu = refreshed(found, centre, without)
         tau = tau + DAMPING * used * (new_tau - tau)
         nu = nu + DAMPING * used * (new_nu - nu)
-        tau, nu, site, crowded = barrier((tau, nu, used * site, crowded))
+        tau, nu, site, dominated = barrier((tau, nu, used * site, dominated))
         weighted = [tau * row for row in h]
         force = nu - tau * offset
         planes = [weighted[i] * h[j] for i, j in TRIANGLE]
-        *sums, site, crowded = total([*planes, *(force * row for row in h), site, crowded])
+        *sums, site, dominated = total([*planes, *(force * row for row in h), site, dominated])
         evidence = belief.evidence(site)
         size = len(TRIANGLE)
         after = _solved(
             self.known.information + stacked(unrolled.as_array(sums[:size])),
             self.known.gradient + unrolled.as_array(sums[size:]),
         )
-        return _Propagation(tau, nu, after), evidence, crowded > 0
+        return _Propagation(tau, nu, after), evidence, dominated > 0
 
 
 def refreshed(found: Moments, centre: Array, without: Array) -> tuple[Array, Array]:

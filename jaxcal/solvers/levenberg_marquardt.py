@@ -10,7 +10,7 @@ the cost falls by at least a ten-thousandth of the decrease that the quadratic m
 damping falls where the cost falls by at least a quarter of it, and grows tenfold where a step is
 refused. Every loop of the package uses this rule, by :func:`judge_step`. Steps are Gauss-Newton's
 where the gradient cosine is above :data:`EXACT_BELOW`, and exact Newton steps below it; where the
-exact matrix is indefinite, the same place is evaluated again without second derivatives.
+exact matrix is indefinite, the same iterate is evaluated again without second derivatives.
 
 A problem stops when the largest cosine between its residual and a column of its Jacobian is below
 the tolerance, when its residuals are nothing but rounding, or when steps gain no more than
@@ -37,16 +37,16 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxcal.model.batch import ImagePlanes, Iterate, barrier, choose
 from jaxcal.model.observations import LocalUnknown, MediumPrior, Observation
 from jaxcal.solvers import dense
-from jaxcal.solvers.normal_equations import Normal, accumulate
+from jaxcal.solvers.normal_equations import NormalEquations, accumulate
 
-ENOUGH = 1e-4
-"""Share of the predicted decrease that a step has to bring to be taken."""
+ACCEPT_RATIO = 1e-4
+"""Least ratio of actual to predicted decrease with which a step is taken."""
 
-GOOD = 0.25
-"""Share of the predicted decrease above which the damping falls."""
+GOOD_RATIO = 0.25
+"""Least ratio of actual to predicted decrease with which the damping falls."""
 
-LESS, LESS_EXACT, MORE = 0.1, 1e-4, 10.0
-"""Factors of the damping after a good Gauss-Newton step, a good exact one, a refused one."""
+DAMPING_DECREASE, DAMPING_DECREASE_EXACT, DAMPING_INCREASE = 0.1, 1e-4, 10.0
+"""Factors on the damping after a good Gauss-Newton step, a good exact one, and a refused one."""
 
 LEAST_DAMPING, LARGEST_DAMPING = 1e-8, 1e12
 """Least damping after a refused step, and the damping above which a problem is given up."""
@@ -54,19 +54,19 @@ LEAST_DAMPING, LARGEST_DAMPING = 1e-8, 1e12
 EXACT_BELOW = 0.2
 """Gradient cosine below which exact second derivatives are used."""
 
-SQUARED = 100.0
+QUADRATIC_FACTOR = 100.0
 """Assumed upper bound on the cosine after an exact Newton step over the square of the cosine before
 it. From a cosine below 1e-6, the worst of 1,024 simulated problems came to 2.3e-12."""
 
-SMALL = 1e-11
+FINAL_DECREASE = 1e-11
 """Largest predicted relative decrease of the cost by a last step that is not evaluated."""
 
-IDLE = 4
-"""Steps in a row without a gain above rounding before a problem is called settled."""
+MOST_STALLED = 4
+"""Successive steps without a gain above rounding after which a problem has converged."""
 
 
-Equations = Callable[[Any, Float[Array, " batch"]], Normal]
-"""Normal equations at a place, with exact second derivatives where a gate is 1."""
+Equations = Callable[[Any, Float[Array, " batch"]], NormalEquations]
+"""From unknowns, and 1 where second derivatives are to be exact, to their normal equations."""
 
 
 class Judged(eqx.Module):
@@ -75,12 +75,12 @@ class Judged(eqx.Module):
     Attributes:
         accept: the step is taken.
         damping: Marquardt's lambda for the next step.
-        idle: steps in a row without a gain.
+        stalled: number of successive steps without a gain above rounding.
     """
 
     accept: Bool[Array, " batch"]
     damping: Float[Array, " batch"]
-    idle: Int[Array, " batch"]
+    stalled: Int[Array, " batch"]
 
 
 def judge_step(
@@ -89,11 +89,11 @@ def judge_step(
     half_cost: Float[Array, " batch"],
     rounding: Float[Array, " batch"],
     damping: Float[Array, " batch"],
-    idle: Int[Array, " batch"],
+    stalled: Int[Array, " batch"],
     *,
     exact: Bool[Array, " batch"],
     retry: Bool[Array, " batch"],
-    less_exact: float = LESS_EXACT,
+    decrease_exact: float = DAMPING_DECREASE_EXACT,
     allowance: Float[Array, " batch"] | float = 0.0,
 ) -> Judged:
     """The acceptance rule.
@@ -104,25 +104,25 @@ def judge_step(
         half_cost: before the step.
         rounding: of one whitened residual.
         damping: of the step.
-        idle: steps in a row without a gain before it.
+        stalled: number of successive steps without a gain before it.
         exact: the step came from exact second derivatives.
-        retry: there was no step; the same place was evaluated again.
-        less_exact: factor of the damping after a good exact step.
+        retry: there was no step; the same iterate was evaluated again.
+        decrease_exact: factor on the damping after a good exact step.
         allowance: by how much half the cost may have grown for other reasons than the step.
     """
     # Each residual is off by its rounding, so half their sum of squares is off by this much.
     noise = 8 * jnp.finfo(half_cost.dtype).eps * half_cost + 2 * rounding * jnp.sqrt(half_cost)
     least = -noise - allowance
-    accept = (decrease >= ENOUGH * predicted + least) | retry
-    good = (decrease >= GOOD * predicted + least) & jnp.logical_not(retry)
+    accept = (decrease >= ACCEPT_RATIO * predicted + least) | retry
+    good = (decrease >= GOOD_RATIO * predicted + least) & jnp.logical_not(retry)
     # The exact matrix needs no damping; Gauss-Newton's needs less and less.
-    factor = jnp.where(good, jnp.where(exact, less_exact, LESS), 1.0)
-    raised = jnp.maximum(MORE * damping, LEAST_DAMPING)
-    gained = jnp.where(decrease > noise, 0, idle + 1)
+    factor = jnp.where(good, jnp.where(exact, decrease_exact, DAMPING_DECREASE), 1.0)
+    raised = jnp.maximum(DAMPING_INCREASE * damping, LEAST_DAMPING)
+    gained = jnp.where(decrease > noise, 0, stalled + 1)
     return Judged(
         accept,
         jnp.where(accept, factor * damping, raised),
-        jnp.where(accept & jnp.logical_not(retry), gained, idle),
+        jnp.where(accept & jnp.logical_not(retry), gained, stalled),
     )
 
 
@@ -130,23 +130,23 @@ class Descent(eqx.Module):
     """The state of every problem.
 
     Attributes:
-        place: the best so far.
-        cost: sum of squared (whitened) residuals at ``place``.
-        cosine: gradient cosine at ``place``; after a last step that was not evaluated, its bound.
-        candidate: the place to evaluate next.
-        retry: ``candidate`` is ``place`` again, with more damping or without second derivatives.
+        iterate: the best unknowns so far.
+        cost: sum of squared (whitened) residuals at ``iterate``.
+        cosine: gradient cosine at ``iterate``; after a last step that was not evaluated, its bound.
+        candidate: the unknowns to evaluate next.
+        retry: ``candidate`` is ``iterate`` again, with more damping or without second derivatives.
         exact_used: 1 where the step to the candidate came from an exact curvature.
         exact_next: 1 where the candidate's curvature is to be exact.
         damping: Marquardt's lambda.
         predicted: predicted decrease of half the cost by the step to the candidate.
-        idle: steps in a row without a gain.
+        stalled: number of successive steps without a gain above rounding.
         iterations: number of evaluations.
-        settled: converged, as far as rounding allows.
-        active: the problem goes on.
+        converged: the gradient cosine met its tolerance, or steps gain nothing above rounding.
+        active: the problem is not finished.
         trace: best cost after each of the first evaluations; NaN beyond the last; None: not kept.
     """
 
-    place: Any
+    iterate: Any
     cost: Float[Array, " batch"]
     cosine: Float[Array, " batch"]
     candidate: Any
@@ -155,9 +155,9 @@ class Descent(eqx.Module):
     exact_next: Float[Array, " batch"]
     damping: Float[Array, " batch"]
     predicted: Float[Array, " batch"]
-    idle: Int[Array, " batch"]
+    stalled: Int[Array, " batch"]
     iterations: Int[Array, " batch"]
-    settled: Bool[Array, " batch"]
+    converged: Bool[Array, " batch"]
     active: Bool[Array, " batch"]
     trace: Float[Array, "trace batch"] | None = None
 
@@ -175,7 +175,7 @@ class Descent(eqx.Module):
         """
         no, count = jnp.zeros(number.shape, bool), jnp.zeros(number.shape, jnp.int32)
         return cls(
-            place=start,
+            iterate=start,
             cost=number + jnp.inf,
             cosine=number + jnp.inf,
             candidate=start,
@@ -184,9 +184,9 @@ class Descent(eqx.Module):
             exact_next=number,
             damping=number + damping,
             predicted=number,
-            idle=count,
+            stalled=count,
             iterations=count,
-            settled=no,
+            converged=no,
             active=~no,
             trace=empty_trace(trace, number),
         )
@@ -222,22 +222,24 @@ class Rounding(eqx.Module):
     @classmethod
     def of(cls, iterate: Iterate, observation: Observation, images: ImagePlanes) -> Rounding:
         """From the size of the coordinates."""
-        return cls.at(reach(iterate, images), observation.largest_weight(), images)
+        return cls.at(largest_coordinate(iterate, images), observation.largest_weight(), images)
 
     @classmethod
-    def at(cls, reach: Array, weight: Array, images: ImagePlanes) -> Rounding:
+    def at(cls, largest_coordinate: Array, weight: Array, images: ImagePlanes) -> Rounding:
         """From the size of the coordinates and the largest weight of a mm."""
-        one = jnp.finfo(reach.dtype).eps * reach * weight
+        one = jnp.finfo(largest_coordinate.dtype).eps * largest_coordinate * weight
         return cls(one, 3 * images.mask.shape[1] * (2 * one) ** 2)
 
 
-def reach(iterate: Iterate, images: ImagePlanes) -> Float[Array, " batch"]:
+def largest_coordinate(iterate: Iterate, images: ImagePlanes) -> Float[Array, " batch"]:
     """The largest coordinate of a problem's poses and target, mm."""
     away = jnp.max(images.mask * jnp.max(jnp.abs(images.origin), axis=0), axis=1)
     return jnp.maximum(away, jnp.max(jnp.abs(iterate.point), axis=0))
 
 
-def gradient_cosine(normal: Normal, vanished: Float[Array, " batch"]) -> Float[Array, " batch"]:
+def gradient_cosine(
+    normal: NormalEquations, vanished: Float[Array, " batch"]
+) -> Float[Array, " batch"]:
     """max_k |g_k| / (|J_k| |r|), 0 where the residuals vanish; NaN where the cost is not finite."""
     length = jnp.sqrt(jnp.abs(normal.diagonal()) * normal.cost)
     cosine = jnp.max(jnp.abs(normal.gradient) / jnp.where(length > 0, length, 1.0), axis=0)
@@ -246,11 +248,11 @@ def gradient_cosine(normal: Normal, vanished: Float[Array, " batch"]) -> Float[A
 
 
 def damped_step(
-    normal: Normal, damping: Float[Array, " batch"]
+    normal: NormalEquations, damping: Float[Array, " batch"]
 ) -> tuple[Float[Array, "p batch"], Float[Array, " batch"], Bool[Array, " batch"]]:
-    """The damped step, the decrease of half the cost that it predicts, and where it is lost.
+    """The damped step, the decrease of half the cost that it predicts, and where there is none.
 
-    A step is lost, and zero, where the matrix is not positive definite.
+    The step is zero where the matrix is not positive definite.
     """
     damping = damping + 16 * jnp.finfo(damping.dtype).eps
     diagonal = normal.diagonal()
@@ -258,10 +260,10 @@ def damped_step(
     eye = jnp.eye(len(diagonal), dtype=damping.dtype)[..., None]
     matrix, gradient = barrier((normal.stacked() + damping * diagonal * eye, normal.gradient))
     move = barrier(dense.solve_batch_last(matrix, -gradient))
-    lost = jnp.logical_not(jnp.isfinite(jnp.sum(move, axis=0)))
-    move = jnp.where(lost, 0.0, move)
+    indefinite = jnp.logical_not(jnp.isfinite(jnp.sum(move, axis=0)))
+    move = jnp.where(indefinite, 0.0, move)
     held = damping * diagonal * move - normal.gradient
-    return barrier(move), 0.5 * jnp.sum(held * move, axis=0), lost
+    return barrier(move), 0.5 * jnp.sum(held * move, axis=0), indefinite
 
 
 def iterate_once(
@@ -272,13 +274,13 @@ def iterate_once(
     max_steps: int,
     *,
     undamped: bool = False,
-    less_exact: float = LESS_EXACT,
+    decrease_exact: float = DAMPING_DECREASE_EXACT,
     exact_below: float = EXACT_BELOW,
 ) -> Descent:
     """Evaluate every active problem's candidate, and choose the next one.
 
-    Normal equations are used at once and not stored: to evaluate a place again, where a step from
-    it has failed, is cheaper than to keep them for every problem.
+    Normal equations are used at once and not stored: to evaluate an iterate again, where a step
+    from it has failed, is cheaper than to keep them for every problem.
     """
     normal = barrier(equations(state.candidate, state.exact_next))
 
@@ -289,57 +291,57 @@ def iterate_once(
         half,
         rounding.residual,
         state.damping,
-        state.idle,
+        state.stalled,
         exact=state.exact_used > 0,
         retry=state.retry,
-        less_exact=less_exact,
+        decrease_exact=decrease_exact,
     )
-    accept, damping, idle = judged.accept, judged.damping, judged.idle
+    accept, damping, stalled = judged.accept, judged.damping, judged.stalled
     if undamped:
         accept, damping = jnp.isfinite(normal.cost), jnp.zeros_like(damping)
 
-    place = choose(accept & state.active, state.candidate, state.place)
+    iterate = choose(accept & state.active, state.candidate, state.iterate)
     cost = jnp.where(accept, normal.cost, state.cost)
     cosine = jnp.where(accept, gradient_cosine(normal, rounding.vanished), state.cosine)
-    move, predicted, lost = damped_step(normal, damping)
-    lost = lost & accept
-    # Indefinite: the same place again without second derivatives, or with more damping.
-    more = jnp.maximum(MORE * damping, LEAST_DAMPING)
-    damping = jnp.where(lost & (state.exact_next == 0), more, damping)
-    retry = lost | jnp.logical_not(accept)
-    candidate = choose(retry, place, state.candidate.moved(move))
+    move, predicted, indefinite = damped_step(normal, damping)
+    indefinite = indefinite & accept
+    # Indefinite: the same iterate again without second derivatives, or with more damping.
+    more = jnp.maximum(DAMPING_INCREASE * damping, LEAST_DAMPING)
+    damping = jnp.where(indefinite & (state.exact_next == 0), more, damping)
+    retry = indefinite | jnp.logical_not(accept)
+    candidate = choose(retry, iterate, state.candidate.moved(move))
 
     iterations = state.iterations + 1
-    stuck = (idle >= IDLE) | (damping > LARGEST_DAMPING) | (iterations >= max_steps)
-    left = SQUARED * cosine * cosine
-    last = (
+    stopped = (stalled >= MOST_STALLED) | (damping > LARGEST_DAMPING) | (iterations >= max_steps)
+    squared_cosine = QUADRATIC_FACTOR * cosine * cosine
+    final_step = (
         (state.exact_next > 0)
         & (damping < 1e-6)
         & jnp.logical_not(retry)
-        & (left <= tolerance)
-        & (predicted <= SMALL * cost)
+        & (squared_cosine <= tolerance)
+        & (predicted <= FINAL_DECREASE * cost)
         & (cosine > tolerance)
     )
-    exact_next = (cosine < exact_below) & jnp.logical_not(lost | undamped)
+    exact_next = (cosine < exact_below) & jnp.logical_not(indefinite | undamped)
     after = Descent(
-        place=place,
+        iterate=iterate,
         cost=cost,
-        cosine=jnp.where(last, left, cosine),
+        cosine=jnp.where(final_step, squared_cosine, cosine),
         candidate=candidate,
         retry=retry,
         exact_used=jnp.where(accept, state.exact_next, state.exact_used),
         exact_next=jnp.where(exact_next, 1.0, 0.0).astype(half.dtype),
         damping=damping,
         predicted=predicted,
-        idle=idle,
+        stalled=stalled,
         iterations=iterations,
-        settled=(cosine <= 10 * tolerance) | last | (idle >= IDLE),
-        active=(cosine > tolerance) & jnp.logical_not(stuck | last),
+        converged=(cosine <= 10 * tolerance) | final_step | (stalled >= MOST_STALLED),
+        active=(cosine > tolerance) & jnp.logical_not(stopped | final_step),
         trace=recorded(state.trace, state.iterations, cost),
     )
-    after = choose(state.active, after, eqx.tree_at(lambda old: old.place, state, place))
+    after = choose(state.active, after, eqx.tree_at(lambda old: old.iterate, state, iterate))
     return eqx.tree_at(
-        lambda new: new.place, after, choose(last & state.active, candidate, after.place)
+        lambda new: new.iterate, after, choose(final_step & state.active, candidate, after.iterate)
     )
 
 
@@ -360,7 +362,7 @@ def minimise(
         start: unknowns to start from.
         observation: the objective.
         images: the data.
-        medium: what is known of sound speed and delay beforehand.
+        medium: prior of sound speed and delay, or None.
         damping: first lambda, relative to the diagonal; 0 for Gauss-Newton, which takes every step.
         tolerance: gradient cosine to stop at; by default 1e-10 in float64, 1e-4 in float32.
         max_steps: most passes.
@@ -375,13 +377,15 @@ def minimise(
     rounding = barrier(Rounding.of(start, observation, images))
     undamped = damping == 0
 
-    def equations(iterate: Iterate, exact: Array) -> Normal:
+    def equations(iterate: Iterate, exact: Array) -> NormalEquations:
         return accumulate(iterate, observation, images, None if undamped else exact, medium)
 
     begun = Descent.before(start, jnp.zeros_like(images.mask[:, 0]), damping, trace=trace)
     # The curvature jumps where offsets reach or leave their bounds, so a good exact step says
     # little about the next one.
-    less_exact = LESS if isinstance(observation, LocalUnknown) else LESS_EXACT
+    decrease_exact = (
+        DAMPING_DECREASE if isinstance(observation, LocalUnknown) else DAMPING_DECREASE_EXACT
+    )
 
     def one(state: Descent) -> Descent:
         return iterate_once(
@@ -391,12 +395,12 @@ def minimise(
             tolerance,
             max_steps,
             undamped=undamped,
-            less_exact=less_exact,
+            decrease_exact=decrease_exact,
         )
 
     return jax.lax.while_loop(lambda state: jnp.any(state.active), one, begun)
 
 
 def default_tolerance(dtype: jnp.dtype) -> float:
-    """Gradient cosine that a precision can reach."""
+    """Gradient cosine that the arithmetic of ``dtype`` can reach."""
     return 1e-10 if float(jnp.finfo(dtype).eps) < 1e-10 else 1e-4

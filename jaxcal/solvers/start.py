@@ -38,7 +38,7 @@ from jaxcal.model import unrolled
 from jaxcal.model.batch import ImagePlanes, Iterate, barrier, choose, total
 from jaxcal.model.observations import InPlane
 from jaxcal.model.parameters import Parameters
-from jaxcal.model.unknowns import EXTRA, TABLE, Blocks
+from jaxcal.model.unknowns import FURTHER, TABLE, Blocks
 from jaxcal.runtime.compiler import traced_once
 from jaxcal.solvers import dense
 from jaxcal.solvers.closed_form.single import Start
@@ -62,20 +62,20 @@ class ConventionalStart(eqx.Module):
     searched: Bool[Array, " batch"]
 
     @property
-    def place(self) -> Iterate:
+    def iterate(self) -> Iterate:
         """The conventional fit, from which most methods start."""
-        return self.fit.place
+        return self.fit.iterate
 
 
 class GivenStart(eqx.Module):
     """Conventional fits that were found before.
 
     Attributes:
-        place: the conventional fits.
+        iterate: the conventional fits.
         searched: whether they had to be searched for.
     """
 
-    place: Iterate
+    iterate: Iterate
     searched: Bool[Array, " batch"]
 
     @classmethod
@@ -196,14 +196,14 @@ class Reduced(eqx.Module):
         of_mean = barrier(dense.product_batch_last(self.spread, self.pulled + pull))
         target = seen + dense.product_batch_last(self.rotation, of_mean)
         depth = scale[1] * (self.mean[1] - self.face) + self.face
-        free = {name: [TABLE[name].nominal * one] * TABLE[name].size for name in EXTRA}
+        free = {name: [TABLE[name].nominal * one] * TABLE[name].size for name in FURTHER}
         free["scale"] = [*scale]
-        extras = [value for name in EXTRA if name in blocks for value in free[name]]
+        values = [value for name in FURTHER if name in blocks for value in free[name]]
         return Iterate(
             jnp.stack([lateral, jnp.cross(axial, lateral, axis=0), axial], axis=1),
             of_mean - scale[0] * self.mean[0] * lateral - depth * axial,
             self.centre + target / self.count,
-            jnp.stack(extras) if extras else jnp.zeros((0, *one.shape), one.dtype),
+            jnp.stack(values) if values else jnp.zeros((0, *one.shape), one.dtype),
             blocks,
         )
 
@@ -301,8 +301,8 @@ def conventional(
     _, fit = jax.lax.while_loop(unfinished, one_round, (jnp.zeros((), jnp.int32), empty))
     if not fitted:
         # A sound problem keeps its start, even if others needed the search.
-        fit = replace(fit, place=choose(sound, start, fit.place))
-    return ConventionalStart(fit, choose(sound, start, fit.place), jnp.logical_not(sound))
+        fit = replace(fit, iterate=choose(sound, start, fit.iterate))
+    return ConventionalStart(fit, choose(sound, start, fit.iterate), jnp.logical_not(sound))
 
 
 def cube_rotations() -> np.ndarray:

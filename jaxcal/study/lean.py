@@ -160,18 +160,18 @@ def solve(
     # Parts of the calibration that are not used are not computed.
     found = solve_problems(problems, given, plan, begun=begun)
     matrix = jnp.asarray(found.image_to_probe)
-    place = Iterate(
+    iterate = Iterate(
         jnp.moveaxis(matrix[:, :3, :3], 0, -1),
         matrix[:, :3, 3].T,
         jnp.asarray(found.point).T,
-        truth.extras,
+        truth.further_values,
         truth.blocks,
     )
-    pairs = ((place.translation, truth.translation), (place.point, truth.point))
+    pairs = ((iterate.translation, truth.translation), (iterate.point, truth.point))
     away = [jnp.sqrt(jnp.sum((one - true) ** 2, axis=0)) for one, true in pairs]
     return Measured(
-        rp=_precision(place, truth, batch.test),
-        rotation_error=chord_angle(place.rotation - truth.rotation),
+        rp=_precision(iterate, truth, batch.test),
+        rotation_error=chord_angle(iterate.rotation - truth.rotation),
         translation_error=away[0],
         point_error=away[1],
         sigma=jnp.asarray(found.sigma),
@@ -180,25 +180,25 @@ def solve(
     )
 
 
-def _mean_squares(place: Iterate, images: ImagePlanes) -> Float[Array, "3 batch"]:
+def _mean_squares(iterate: Iterate, images: ImagePlanes) -> Float[Array, "3 batch"]:
     """Mean squares of lateral error, range error and elevational offset at an estimate, mm^2."""
-    q, _ = targets(place, images)
+    q, _ = targets(iterate, images)
     far = jnp.sqrt(q[1] * q[1] + q[2] * q[2])
     errors = [q[0] - images.lateral, far - images.distance, q[1]]
     return jnp.stack(total([images.mask * error * error for error in errors])) / images.used
 
 
-def _precision(place: Iterate, truth: Iterate, test: ImagePlanes) -> Float[Array, " batch"]:
+def _precision(iterate: Iterate, truth: Iterate, test: ImagePlanes) -> Float[Array, " batch"]:
     """Eq. 8, as :func:`jaxcal.diagnostics.metrics.reconstruction_precision`, mm.
 
     Reconstructed points are taken relative to the true target. They are near it, so that one pass
     gives their mean and spread without loss of digits.
     """
-    rows = [[entry[:, None] for entry in row] for row in place.rotation]
+    rows = [[entry[:, None] for entry in row] for row in iterate.rotation]
     flat = [test.lateral, 0, test.distance]
     in_probe = [
         value + origin[:, None]
-        for value, origin in zip(unrolled.apply(rows, flat), place.translation, strict=True)
+        for value, origin in zip(unrolled.apply(rows, flat), iterate.translation, strict=True)
     ]
     poses = [[test.rotation[3 * i + j] for j in range(3)] for i in range(3)]
     away = [
