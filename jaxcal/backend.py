@@ -5,11 +5,13 @@ A calibration in jaxcal is least squares: unknowns that step on a manifold (:cla
 :func:`channel_residual`), a minimiser, and the derivative of the minimum by the implicit function
 theorem. Every method begins at :func:`initial_fit`.
 
-There are versions of these for batches, where arrays are planes with the problems last:
-:class:`ImagePlanes` (the data), :class:`Iterate` (the unknowns), an :class:`Observation`
-(:class:`Points`, :class:`OwnCovariances`, :class:`TrackedPoints`, :class:`InPlane`,
-:class:`BoundedOffsets`, :class:`ChannelDistances`, or one of your own), :func:`accumulate` (the
-normal equations in one pass over the images), :func:`minimise` and :func:`implicit_tangent`.
+For a batch of problems there are :class:`ImagePlanes` (the data), :class:`Iterate` (the unknowns),
+an :class:`Observation` (:class:`Points`, :class:`OwnCovariances`, :class:`TrackedPoints`,
+:class:`InPlane`, :class:`BoundedOffsets`, :class:`ChannelDistances`, or one of your own),
+:func:`accumulate` (the :class:`NormalEquations`, in one pass over the images), :func:`minimise` and
+:func:`implicit_tangent`. A number of every image is a plane (batch, images); the batch axis of all
+other arrays is the last.
+
 :class:`LevenbergMarquardt` is the same loop behind optimistix's interface, for residuals of any
 shape. :func:`arrow_least_squares` is the loop for problems with shared unknowns and one local
 unknown for each row.

@@ -69,7 +69,7 @@ class Solved(eqx.Module):
 
 
 class Average(eqx.Module):
-    """The average over the offsets' laws, problems first.
+    """The average over the offsets' laws; batch axis first.
 
     Attributes:
         covariance: of the unknowns.
@@ -293,7 +293,7 @@ def covariance_and_observability(
     design: Float[Array, "p p batch"],
     variance: Float[Array, " batch"],
     scale: Float[Array, "p batch"],
-    reach: Float[Array, " batch"],
+    largest_sd: Float[Array, " batch"],
     *,
     bounded: bool = False,
 ) -> tuple[Float[Array, "p p batch"], Observability]:
@@ -304,7 +304,7 @@ def covariance_and_observability(
         design: of the unweighted residuals, offsets known.
         variance: of the residuals from which ``information`` was formed.
         scale: factors that turn every unknown's tangent into mm at the target.
-        reach: largest useful SD of a direction, mm.
+        largest_sd: largest useful SD of a direction, mm.
         bounded: bounds confine the offsets, and with them every direction, so all that matters
             about the information is whether it is singular.
     """
@@ -313,7 +313,7 @@ def covariance_and_observability(
     both = scale[:, None] * scale
     weighted, unweighted = jax.lax.stop_gradient((information / both, design / both))
     total = jnp.trace(weighted)
-    least = threshold(eps) * total if bounded else jax.lax.stop_gradient(variance / reach**2)
+    least = threshold(eps) * total if bounded else jax.lax.stop_gradient(variance / largest_sd**2)
     floor = threshold(eps) * jnp.trace(unweighted)
     # A ridge at the level of rounding keeps an unobservable direction finite.
     ridge = jax.lax.stop_gradient(16 * eps * (design if bounded else information) * eye)
@@ -451,7 +451,7 @@ def _medium(
     blocks, speed = plan.blocks, problem.nominal_sound_speed
     found: dict[str, Array | None] = {}
 
-    def believed(which: int) -> Array | None:
+    def prior_sd(which: int) -> Array | None:
         sd = given.medium_sd
         return None if sd is None else jnp.broadcast_to(sd[which], speed.shape)
 
@@ -460,11 +460,11 @@ def _medium(
         estimate = speed * parameters.sound_speed
         found["sound_speed_m_s"] = estimate
         found["sound_speed_sd_m_s"] = estimate * jnp.sqrt(covariance[..., at, at])
-        found["sound_speed_prior_m_s"] = believed(0)
+        found["sound_speed_prior_m_s"] = prior_sd(0)
     if "delay" in blocks:
         at = block_slice(blocks, "delay").start
         before = 0.0 if problem.delay is None else problem.delay
         found["delay_s"] = before + parameters.delay / (1e3 * speed)
         found["delay_sd_s"] = jnp.sqrt(covariance[..., at, at]) / (1e3 * speed)
-        found["delay_prior_s"] = believed(1)
+        found["delay_prior_s"] = prior_sd(1)
     return Medium(**found) if found else None

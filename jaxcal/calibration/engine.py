@@ -183,7 +183,7 @@ def _solve_chunks_kept(
         "jaxcal.calibration.programs:solve_some_chunks",
         (padded, given, np.asarray(pieces, np.int32)),
         (plan, chunk),
-        flags=compiler.batch_wishes(),
+        flags=compiler.batch_flags(),
         label=label,
         hold=partial(_kept_as_jax_holds, problem=problems) if done else executables.in_numpy,
     )

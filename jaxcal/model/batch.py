@@ -32,7 +32,7 @@ RIGID_UNKNOWNS = 9
 
 
 class ElementPlanes(eqx.Module):
-    """What every element heard.
+    """The times of flight, as distances.
 
     Attributes:
         distances: one-way distances at the nominal sound speed and delay, mm.
@@ -49,12 +49,12 @@ class ImagePlanes(eqx.Module):
     """What was measured, one plane (batch, images) for every number.
 
     Attributes:
-        rotation: R_i by rows.
-        origin: b_i, mm.
-        lateral: lateral position at the nominal scale, mm.
-        axial: range from pixel row 0 at the nominal scale, mm.
+        rotation: R_i, from the probe's frame to the tracker's: entry (j, k) at index 3 j + k.
+        origin: b_i, the probe's origin in the tracker's frame, mm.
+        lateral: lateral position of the target's image at the nominal scale, mm.
+        axial: its range from pixel row 0 at the nominal scale, mm.
         face: range of pixel row 0, mm.
-        mask: 1 for used images; the others hold harmless numbers.
+        mask: 1 for used images; the others hold finite values without meaning.
         channels: the times of flight, or None.
     """
 
@@ -72,7 +72,7 @@ class ImagePlanes(eqx.Module):
 
         Args:
             problems: the batch.
-            channels: take the times of flight along.
+            channels: include the times of flight.
 
         Raises:
             InputError: one problem, or a batch with more axes.
@@ -88,7 +88,7 @@ class ImagePlanes(eqx.Module):
             return jnp.where(used, values, jnp.asarray(instead, problems.mask.dtype))
 
         points = problems.measurements * problems.spacing[:, None, :]
-        # Turned round all at once: entry by entry, every plane would read all of the poses.
+        # Transposed all at once: entry by entry, every plane would read all of the poses.
         entries = problems.poses.reshape(*problems.mask.shape, 16)
         entries = barrier(jnp.moveaxis(entries, -1, 0)).reshape(4, 4, *problems.mask.shape)
         rotation = [plane(entries[i, j], float(i == j)) for i in range(3) for j in range(3)]
@@ -121,7 +121,7 @@ class ImagePlanes(eqx.Module):
         return jnp.sum(self.mask, axis=1)
 
     def padded(self) -> ImagePlanes:
-        """With unused images added up to whole vectors, so that loops have no remainder."""
+        """With unused images added up to whole 64-byte vectors, so that loops have no remainder."""
         if self.channels is not None:
             return self
         added = pad_images(self.mask).shape[1] - self.mask.shape[1]
@@ -155,10 +155,11 @@ class Iterate(eqx.Module):
     """A value of the unknowns of every problem of a batch; the batch axis is last.
 
     Attributes:
-        rotation: of X.
-        translation: of X, mm.
-        point: c, mm.
-        further_values: components of the free further unknowns, in the order of the blocks.
+        rotation: of X, from the image's frame to the probe's.
+        translation: of X: the image's origin in the probe's frame, mm.
+        point: the target c in the tracker's frame, mm.
+        further_values: components of the free further unknowns, in the order of the blocks: factors
+            on scale and sound speed, delay in mm.
         blocks: which unknowns are free (static).
     """
 
@@ -192,14 +193,14 @@ class Iterate(eqx.Module):
         return size(self.blocks)
 
     def further(self, name: str) -> Float[Array, "k batch"] | None:
-        """The values of a further unknown, or None where it is not free."""
+        """The values of a further unknown, one row for each component; None if it is not free."""
         if name not in self.blocks:
             return None
         at = block_slice(self.blocks, name)
         return self.further_values[at.start - RIGID_UNKNOWNS : at.stop - RIGID_UNKNOWNS]
 
     def parameters(self) -> Parameters:
-        """The parameters, with a leading axis; what is not free is nominal."""
+        """The parameters, batch axis first; unknowns that are not free are nominal."""
         rotation = jnp.moveaxis(self.rotation, -1, 0)
         found = jax.vmap(Parameters.of)(rotation, self.translation.T, self.point.T)
         free = {name: self.further(name) for name in FURTHER}
@@ -271,7 +272,7 @@ def _further_names(blocks: Blocks) -> list[str]:
 
 @jax.jit
 def targets(iterate: Iterate, images: ImagePlanes) -> tuple[Vector, Matrix]:
-    """q_i, and its derivative M_i = R' R_i' by the target, as planes."""
+    """q_i (mm, in image i's frame), and its derivative M_i = R' R_i' by the target, as planes."""
     rotation, translation = iterate.rotation[..., None], iterate.translation[..., None]
     inverse = [[rotation[k, a] for k in range(3)] for a in range(3)]
     back = [[images.rotation[3 * j + i] for j in range(3)] for i in range(3)]

@@ -125,16 +125,26 @@ class Observation(eqx.Module):
 
     sigma: eqx.AbstractVar[Float[Array, "components batch"]]
     whitened: ClassVar[bool] = True
-    """Whether residuals are in SDs; otherwise their variance is estimated from them."""
+    """Whether residuals are divided by their SDs; else their variance is estimated from them."""
     oriented: ClassVar[bool] = False
-    """Whether residuals depend on how the image is turned in other ways than through q."""
+    """Whether residuals depend on the image's orientation other than through q."""
 
     def __check_init__(self) -> None:
         _check_values("sigma", self.sigma)
 
     @abc.abstractmethod
     def components(self, q: Vector, further: Further, images: ImagePlanes) -> list[Component]:
-        """Residuals of every image; one entry for each SD."""
+        """The residuals of every image.
+
+        Args:
+            q: the target in every image's frame [lateral, elevational, axial], mm: three planes
+                (batch, n).
+            further: the free further unknowns; for an ``oriented`` observation also M_i.
+            images: the data.
+
+        Returns:
+            One component for each SD in ``sigma``, in the same order.
+        """
 
     def count(self, images: ImagePlanes) -> Float[Array, "components batch"]:
         """How many residuals each component has."""
@@ -149,16 +159,16 @@ class Observation(eqx.Module):
         return 1 / jnp.min(self.sigma, axis=0)
 
     def geometry(self, images: ImagePlanes) -> Observation:
-        """What shows which unknowns the poses determine, by its residuals without their SDs."""
+        """The observation whose unweighted residuals show which unknowns the poses determine."""
         del images
         return self
 
     def padded(self) -> Observation:
-        """The same for images that are padded."""
+        """The same for images padded by :meth:`ImagePlanes.padded`."""
         return self
 
     def in_units(self, sigma: Float[Array, "components batch"]) -> Observation:
-        """The same for tuning, with residuals in the units that the present SDs set."""
+        """The same, with residuals formed with these SDs where they depend on the ratio of SDs."""
         del sigma
         return self
 
@@ -168,11 +178,11 @@ class Observation(eqx.Module):
         now: Float[Array, "components batch"],
         squares: Float[Array, "components batch"],
     ) -> Float[Array, " batch"] | float:
-        """How much half the cost can have grown only because the residuals' units changed.
+        """Largest growth of half the cost that is due to :meth:`in_units` alone, not to a step.
 
         Args:
-            before: the SDs that gave the residuals their units before.
-            now: the SDs that give them their units now.
+            before: the SDs with which the residuals were formed before.
+            now: the SDs with which they are formed now.
             squares: of the whitened residuals, summed over the images.
         """
         del before, now, squares
@@ -369,7 +379,7 @@ class HeldOffsets(Observation):
 
     Attributes:
         sigma: one.
-        offset: y, mm.
+        offset: y_i, mm.
     """
 
     sigma: Float[Array, "1 batch"]
@@ -394,13 +404,16 @@ class LocalUnknown(Observation):
 
     @abc.abstractmethod
     def local(self, q: Vector, further: Further, images: ImagePlanes) -> tuple[Array, Array]:
-        """The best value for given q, and 1 where it may move (0 where it rests on a bound)."""
+        """The image's own unknown at its best for given q, and 1 where it is free (0 on a bound).
+
+        Both are planes (batch, n). The arguments are those of :meth:`Observation.components`.
+        """
 
     @abc.abstractmethod
     def components_at(
         self, q: Vector, local: Array, further: Further, images: ImagePlanes
     ) -> list[Component]:
-        """:meth:`components` at a value of that unknown."""
+        """:meth:`Observation.components` at a value of the image's own unknown."""
 
     def components(self, q: Vector, further: Further, images: ImagePlanes) -> list[Component]:
         return self.components_at(q, self.local(q, further, images)[0], further, images)

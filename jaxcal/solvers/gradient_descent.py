@@ -20,8 +20,8 @@ from jaxtyping import Array, Float
 
 from jaxcal.model.batch import ImagePlanes, Iterate
 from jaxcal.model.observations import Further, InPlane
-from jaxcal.solvers.other import Fit
 from jaxcal.solvers.plan import Options
+from jaxcal.solvers.with_optimistix import Fit
 
 
 class SteepestDescent(optx.AbstractGradientDescent):

@@ -369,7 +369,8 @@ def minimise(
         trace: how many values of the cost to keep.
 
     Returns:
-        Where every problem stopped.
+        The final state, for every problem: the unknowns (``iterate``), ``cost``, gradient cosine
+        (``cosine``), number of ``iterations``, whether it ``converged``, and the ``trace``.
     """
     if tolerance is None:
         tolerance = default_tolerance(images.mask.dtype)

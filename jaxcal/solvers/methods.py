@@ -36,10 +36,10 @@ from jaxcal.solvers.auto import average_over_laws
 from jaxcal.solvers.convergence import Convergence
 from jaxcal.solvers.gradient_descent import pairwise_gradient
 from jaxcal.solvers.levenberg_marquardt import Descent, minimise
-from jaxcal.solvers.other import Fit, minimise_with, self_tuned_with
 from jaxcal.solvers.plan import DEFAULT_MAX_ELEVATION_MM, Given, Options, SolvePlan
 from jaxcal.solvers.reml import SelfTuned, on_floor, self_tuned
 from jaxcal.solvers.start import ConventionalStart, GivenStart, conventional
+from jaxcal.solvers.with_optimistix import Fit, minimise_with, self_tuned_with
 
 FALLBACK_SIGMA = (0.5, 0.5, 1.0)
 """SDs of lateral position, range and offset (mm), used where too few images determine them."""

@@ -234,18 +234,22 @@ def _eliminated(term: Term, plain: Entry, free: Array) -> Term:
         free: 1 where it may move.
     """
     last = len(term.gradient) - 1
-    bend = jnp.where(term.curvature[last][last] > 0, term.curvature[last][last], plain)
-    give = jnp.where((free > 0) & (bend > 0), 1 / jnp.where(bend > 0, bend, 1.0), 0.0)
-    meets, slope = term.curvature[last][:last], term.gradient[last]
-    held = [unrolled.times(give, entry) for entry in meets]
+    # D and 1/D (0 where the unknown is not free), b = phi_qy, and b/D.
+    own = jnp.where(term.curvature[last][last] > 0, term.curvature[last][last], plain)
+    inverse = jnp.where((free > 0) & (own > 0), 1 / jnp.where(own > 0, own, 1.0), 0.0)
+    coupling, slope = term.curvature[last][:last], term.gradient[last]
+    scaled = [unrolled.times(inverse, entry) for entry in coupling]
 
     def less(entry: Entry, by: Entry, other: Entry) -> Entry:
         return unrolled.add(entry, unrolled.times(-1, unrolled.times(by, other)))
 
     return Term(
-        less(term.cost, give * slope, slope),
-        [less(term.gradient[i], held[i], slope) for i in range(last)],
-        [[less(term.curvature[i][j], held[i], meets[j]) for j in range(last)] for i in range(last)],
+        less(term.cost, inverse * slope, slope),
+        [less(term.gradient[i], scaled[i], slope) for i in range(last)],
+        [
+            [less(term.curvature[i][j], scaled[i], coupling[j]) for j in range(last)]
+            for i in range(last)
+        ],
     )
 
 
@@ -274,6 +278,7 @@ def contributions(
     g = term.gradient[:IN_IMAGE]
     k = [row[:IN_IMAGE] for row in term.curvature[:IN_IMAGE]]
     lever = unrolled.cross(q)
+    # K [q]x and K M; A = [q]x' K + exact [g]x; A [q]x, A M and M' K M.
     across, forth = unrolled.product(k, lever), unrolled.product(k, tracker_to_image)
     inverse = unrolled.transpose(tracker_to_image)
     bent = unrolled.cross([unrolled.times(exact, value) for value in g])
@@ -300,7 +305,7 @@ def contributions(
         return found + unrolled.apply(inverse, values)
 
     gradient = in_rigid(g) + [0] * (unknowns - RIGID_UNKNOWNS)
-    # Of w's own part of the gradient there is no antisymmetric part to take out again.
+    # What depends on the unknowns directly, not through q.
     own: Vector = [0] * unknowns
     for a, place in enumerate(direct, IN_IMAGE):
         own[place] = term.gradient[a]
@@ -312,6 +317,7 @@ def contributions(
             full[row][col] = unrolled.add(full[row][col], twice)
         for b, other in enumerate(direct[a - IN_IMAGE :], a):
             full[place][other] = unrolled.add(full[place][other], term.curvature[a][b])
+    # with_twist takes the skew part of the whole gradient by w; the direct part has none: add it.
     kept = unrolled.cross([unrolled.times(0.5, unrolled.times(exact, own[k])) for k in ROTATION])
     for i, j in ((0, 1), (0, 2), (1, 2)):
         full[3 + i][3 + j] = unrolled.add(full[3 + i][3 + j], kept[i][j])
@@ -390,11 +396,15 @@ def accumulate(
 
     Args:
         iterate: X, c and the further unknowns of every problem.
-        observation: whose residuals.
+        observation: the objective.
         images: the data.
         exact: 1 for exact second derivatives, 0 for Gauss-Newton's curvature; None for the latter
             everywhere.
         medium: prior of sound speed and delay, or None.
+
+    Returns:
+        The normal equations of the step of X, c and the further unknowns; an image's own unknown is
+        eliminated.
     """
     q, tracker_to_image = targets(iterate, images)
     wide = None if exact is None else exact[:, None]
