@@ -66,7 +66,7 @@ ALTERNATION = ("tolerance_rad", "tolerance_mm", "max_rounds", "inner_steps")
 """The options that the alternation alone has."""
 
 LARGEST_CHUNK = 2**31 - 1
-"""Largest number of problems in one call that can be asked for."""
+"""Largest ``chunk``: problems solved side by side."""
 
 P = ParamSpec("P")
 

@@ -1,7 +1,7 @@
 """The residuals of one problem, as arrays with one row an image.
 
 They are the residuals of :mod:`jaxcal.model.observations` in the layout of public arrays, for
-callers with a solver of their own and for the few places that take one problem at a time. Images
+callers with a solver of their own and for code that takes one problem at a time. Images
 left out give zeros.
 """
 

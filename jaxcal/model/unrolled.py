@@ -1,8 +1,8 @@
 """Small dense algebra written out scalar by scalar, for many problems side by side.
 
 A matrix is a list of rows of arrays that all have the same shape, one entry for every problem.
-Written out, a 9x9 Cholesky solve is one straight stretch of code that XLA turns into a
-few vectorised loops over the problems. This form is the fastest to run and the slowest to compile.
+Written out, a 9x9 Cholesky solve is one straight stretch of code that XLA turns into a few
+vectorised loops over the problems. This form is the fastest to run and the slowest to compile.
 Structural zeros are the number 0 and cost nothing.
 
 The functions of single entries are called tens of thousands of times in one trace. Entries are of

@@ -7,8 +7,8 @@ does not call the function at all.
 A program is kept under a key that names everything it depends on: the function's name, the static
 plan, the shapes and dtypes of all arrays, the compiler's flags, and this installation
 (:func:`installation`): jaxlib's binary, the processor's features, the versions of what is traced
-through, and the sources of jaxcal. :mod:`jaxcal.runtime.program_cache` says
-who may write the files. None of JAX's settings is changed.
+through, and the sources of jaxcal. :mod:`jaxcal.runtime.program_cache` says who may write the
+files. None of JAX's settings is changed.
 
 Trees of arrays are described as JSON (:func:`describe`), so that neither pickles nor a trace are
 needed to put a result together. Programs that call functions outside XLA (LAPACK, callbacks) are
@@ -127,7 +127,7 @@ def bucket(count: int) -> int:
 
 
 def in_numpy(arrays: list[jax.Array]) -> list[np.ndarray]:
-    """A result that JAX need not compile anything for: it compiles every operation on its own."""
+    """A result as numpy arrays: each operation on JAX's would compile a program of its own."""
     return [np.asarray(array) for array in arrays]
 
 

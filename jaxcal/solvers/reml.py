@@ -114,15 +114,15 @@ class SelfTuned(eqx.Module):
     Attributes:
         iterate: X, c and the further unknowns.
         sigma: the SDs, mm.
-        updated: the SDs after one more update at ``iterate``.
+        updated: the SDs after one more update at ``iterate``, mm.
         cost: sum of squared (weighted) residuals.
-        change: largest relative change of the SDs by that update.
+        change: largest relative change of the SDs by that update (its logarithm).
         cosine: gradient cosine.
         candidate: the unknowns to evaluate next.
-        proposed: the SDs at ``candidate``.
-        units: the SDs that set the units of the residuals in the last pass.
+        proposed: the SDs at ``candidate``, mm.
+        units: the SDs with which the residuals were formed in the last pass, mm.
         retry: ``candidate`` is ``iterate`` again, with more damping.
-        step_sigma: the SDs for which the step to the candidate was computed.
+        step_sigma: the SDs for which the step to the candidate was computed, mm.
         half_cost: half the cost before that step, with ``step_sigma``.
         predicted: predicted decrease of ``half_cost`` by that step.
         exact_used: 1 where the step came from exact second derivatives.

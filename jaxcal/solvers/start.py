@@ -100,9 +100,9 @@ class Reduced(eqx.Module):
         matrix: Q.
         rhs: b.
         squares: sums of squares of lateral position and range, mm^2.
-        turned: sums of lateral times R_i, range times R_i, side by side.
+        moments: sums of lateral times R_i and of range times R_i, side by side, mm.
         rotation: sum of R_i.
-        pulled: sum of R_i'(centre - b_i).
+        pulled: sum of R_i'(centre - b_i), mm.
         spread: inverse of t's normal matrix, c eliminated.
         least: smallest share of t's diagonal entries that eliminating c and the rest of t leaves.
     """
@@ -114,7 +114,7 @@ class Reduced(eqx.Module):
     matrix: Float[Array, "6 6 batch"]
     rhs: Float[Array, "6 batch"]
     squares: Float[Array, "2 batch"]
-    turned: Float[Array, "3 6 batch"]
+    moments: Float[Array, "3 6 batch"]
     rotation: Float[Array, "3 3 batch"]
     pulled: Float[Array, "3 batch"]
     spread: Float[Array, "3 3 batch"]
@@ -138,7 +138,7 @@ class Reduced(eqx.Module):
         sums = barrier(unrolled.as_array(total(planes)))
         parts = sums[3:].reshape(3, 12, -1)
         lateral, axial, rotation = parts[:, :9].reshape(3, 3, 3, -1)
-        turned = jnp.concatenate([lateral, axial], axis=1)
+        moments = jnp.concatenate([lateral, axial], axis=1)
 
         # c is the mean of B_i X p_i; then t.
         def squared(first: Array, second: Array) -> Array:
@@ -148,13 +148,13 @@ class Reduced(eqx.Module):
         ridge = 2e-12 + 32 * jnp.finfo(x.dtype).eps
         own = barrier(count * (1 + ridge) * eye - squared(rotation, rotation))
         spread, _ = dense.inverse_batch_last(own)
-        mixed = squared(rotation, turned)
+        mixed = squared(rotation, moments)
         follows = barrier(dense.product_batch_last(spread, mixed))
         back_from_t = jnp.swapaxes(mixed, 0, 1)
         # S (x) I: sums of squares and products of the points' coordinates.
         square = jnp.stack([jnp.stack(sums[:2]), jnp.stack(sums[1:3])])
         whole = square[:, None, :, None] * eye[None, :, None]
-        matrix = whole.reshape(6, 6, -1) - squared(turned, turned)
+        matrix = whole.reshape(6, 6, -1) - squared(moments, moments)
         matrix = barrier(matrix - dense.product_batch_last(back_from_t, follows))
         pulled = parts[2, 9:]
         rhs = parts[:2, 9:].reshape(6, -1)
@@ -169,7 +169,7 @@ class Reduced(eqx.Module):
             matrix,
             rhs,
             squares,
-            turned,
+            moments,
             rotation,
             pulled,
             spread,
@@ -191,7 +191,7 @@ class Reduced(eqx.Module):
             tiny = jnp.finfo(one.dtype).tiny
             scale = jnp.maximum(jnp.abs(self._scales(lateral, axial)), tiny)
         columns = jnp.concatenate([scale[0] * lateral, scale[1] * axial])
-        seen = dense.product_batch_last(self.turned, columns)
+        seen = dense.product_batch_last(self.moments, columns)
         pull = dense.product_batch_last(jnp.swapaxes(self.rotation, 0, 1), seen) / self.count
         of_mean = barrier(dense.product_batch_last(self.spread, self.pulled + pull))
         target = seen + dense.product_batch_last(self.rotation, of_mean)
