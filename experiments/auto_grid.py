@@ -56,7 +56,7 @@ ROUNDS = np.array([1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 256])
 RULE = 0
 """In the table's column of rounds: the paper's stopping rule."""
 SIDE_BY_SIDE = 10
-"""Trials whose bounds are alternated together: 100 lanes."""
+"""Trials whose bounds are alternated together: 100 problems of one batch."""
 SUBSET = ((0.5, 6.0), (1.0, 0.5), (3.0, 2.0), (5.0, 0.5), (5.0, 6.0))
 SIZES = (12, 20, 200)
 COMPARED = (
@@ -107,9 +107,9 @@ def hindsight(begun, problems: Problem, drawn: Experiment, bounds: Array) -> Arr
         def each(tree: Any) -> Any:
             return jax.tree.map(lambda leaf: jnp.repeat(leaf, count, axis=0), tree)
 
-        lanes, x, point = each(problems), each(x), each(point)
-        images = ImagePlanes.of(lanes)
-        limit = jnp.tile(bounds, len(test_poses))[:, None] * lanes.mask
+        wide, x, point = each(problems), each(x), each(point)
+        images = ImagePlanes.of(wide)
+        limit = jnp.tile(bounds, len(test_poses))[:, None] * wide.mask
         bounded = BoundedOffsets.of(limit, images)
         start = Iterate.of(jax.vmap(Parameters.of)(x[:, :3, :3], x[:, :3, 3], point), RIGID)
         test_poses, test_points = each(test_poses), each(test_points)
@@ -128,7 +128,7 @@ def hindsight(begun, problems: Problem, drawn: Experiment, bounds: Array) -> Arr
                 max_rounds=rounds,
                 inner_steps=rule.inner_steps,
             )
-            return done.place, judged(done.place)
+            return done.iterate, judged(done.iterate)
 
         steps = jnp.asarray(np.diff(ROUNDS, prepend=0))
         by_rounds = jax.lax.scan(go_on, start, steps)[1]
@@ -141,7 +141,7 @@ def hindsight(begun, problems: Problem, drawn: Experiment, bounds: Array) -> Arr
             max_rounds=rule.max_rounds,
             inner_steps=rule.inner_steps,
         )
-        found = jnp.concatenate([by_rounds, judged(by_rule.place)[None]])
+        found = jnp.concatenate([by_rounds, judged(by_rule.iterate)[None]])
         return found.T.reshape(-1, count, len(ROUNDS) + 1)
 
     batch = (begun.image_to_probe, begun.point, problems, drawn.test_poses, drawn.test_points)

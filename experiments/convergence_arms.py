@@ -20,7 +20,7 @@ from jaxcal.backend import (
     Further,
     ImagePlanes,
     Iterate,
-    Normal,
+    NormalEquations,
     Observation,
     Parameters,
     accumulate,
@@ -29,8 +29,8 @@ from jaxcal.backend import (
 from jaxcal.model.observations import on_circle
 from jaxcal.solvers.alternating import bounded
 from jaxcal.solvers.levenberg_marquardt import (
+    DAMPING_DECREASE,
     EXACT_BELOW,
-    LESS,
     Descent,
     Rounding,
     gradient_cosine,
@@ -66,7 +66,7 @@ class Eliminated(Observation):
         bounds: the same with offsets that are unknowns of their own.
     """
 
-    sigma: Float[Array, "1 lanes"]
+    sigma: Float[Array, "1 batch"]
     bounds: BoundedOffsets
     whitened: ClassVar[bool] = False
 
@@ -113,7 +113,7 @@ class Outcome(NamedTuple):
     def of(cls, fit: Descent) -> Outcome:
         """Of a batch of fits."""
         trace = None if fit.trace is None else fit.trace.T
-        return cls(fit.place.parameters(), fit.cost, fit.cosine, fit.iterations, trace)
+        return cls(fit.iterate.parameters(), fit.cost, fit.cosine, fit.iterations, trace)
 
 
 class Moved(NamedTuple):
@@ -152,14 +152,16 @@ class Bench:
         self.bound = jnp.asarray(self.bounds)[:, None] * jnp.ones(same.IMAGES)
         self.tests = tests_of(self.problems, self.settings)
         self.starts = same.conventional_starts(self.problems)
-        lane = (self.problems, self.starts, self.bound)
+        begun = (self.problems, self.starts, self.bound)
         self._solve = {
-            name: same.chunked(_arm(*arm), *lane, jnp.ones(count)) for name, arm in ARMS.items()
+            name: same.chunked(_arm(*arm), *begun, jnp.ones(count)) for name, arm in ARMS.items()
         }
         steps = jnp.ones(count, jnp.int32)
-        self._alternate = same.chunked(_alternation, *lane, jnp.ones(count), jnp.ones(count), steps)
-        self._three = same.chunked(_three_starts, *lane)
-        self._judge = same.chunked(_judgement, *lane, *self.tests)
+        self._alternate = same.chunked(
+            _alternation, *begun, jnp.ones(count), jnp.ones(count), steps
+        )
+        self._three = same.chunked(_three_starts, *begun)
+        self._judge = same.chunked(_judgement, *begun, *self.tests)
 
     def solve(self, name: str, starts: Parameters, tolerance: float) -> tuple[Any, float]:
         """A second-order arm's fits from the starts, and the seconds that they took."""
@@ -194,8 +196,8 @@ class Bench:
         def information(problems: Problem, parameters: Parameters, bound: Array) -> Array:
             return jnp.moveaxis(_normal(problems, parameters, bound)[0].stacked(), -1, 0)
 
-        lane = (self.problems, parameters, self.bound)
-        found, _ = same.chunked(information, *lane)(*lane)
+        at = (self.problems, parameters, self.bound)
+        found, _ = same.chunked(information, *at)(*at)
         return same.spectra(np.asarray(found), self.problems)[0]
 
 
@@ -234,8 +236,8 @@ def _arm(make: Callable[[Array, ImagePlanes], Observation], exact: bool) -> Call
         images, observation = images.padded(), observation.padded()
         rounding = Rounding.of(place, observation, images)
 
-        def equations(place: Iterate, gate: Array) -> Normal:
-            return accumulate(place, observation, images, gate if exact else None)
+        def equations(iterate: Iterate, newton: Array) -> NormalEquations:
+            return accumulate(iterate, observation, images, newton if exact else None)
 
         def one(state: Descent) -> Descent:
             return iterate_once(
@@ -244,7 +246,7 @@ def _arm(make: Callable[[Array, ImagePlanes], Observation], exact: bool) -> Call
                 rounding,
                 tolerance,
                 STEPS,
-                less_exact=LESS,
+                decrease_exact=DAMPING_DECREASE,
                 exact_below=EXACT_BELOW if exact else 0.0,
             )
 
@@ -269,13 +271,13 @@ def _alternation(
 ) -> Moved:
     done = same.advance(problems, starts, bound, radians, millimetres, rounds)
     return Moved(
-        done.place.parameters(), done.iterations, done.rotation_change, done.translation_change
+        done.iterate.parameters(), done.iterations, done.rotation_change, done.translation_change
     )
 
 
 def _normal(
     problems: Problem, parameters: Parameters, bound: Array
-) -> tuple[Normal, Float[Array, " lanes"]]:
+) -> tuple[NormalEquations, Float[Array, " batch"]]:
     """Normal equations of the bounded problem, offsets eliminated; the cost that is rounding."""
     images = ImagePlanes.of(problems)
     place, observation = Iterate.of(parameters, RIGID), BoundedOffsets.of(bound, images)

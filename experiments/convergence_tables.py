@@ -54,7 +54,7 @@ def needed(steps: np.ndarray, costs: np.ndarray, best: np.ndarray) -> np.ndarray
     return np.where(reached.any(axis=0), steps[np.argmax(reached, axis=0)], np.inf)
 
 
-def lane_iterations(iterations: np.ndarray) -> int:
+def computed_iterations(iterations: np.ndarray) -> int:
     """Iterations computed: a chunk goes on until its slowest problem is done."""
     return int(CHUNK * iterations.reshape(-1, CHUNK).max(axis=1).sum())
 

@@ -81,7 +81,7 @@ def _with_signs(
     y = jax.vmap(target_in_image)(first, known)[..., 1]
     images = ImagePlanes.of(known)
     held = HeldOffsets.of(jnp.where(y < 0, -size, size), images)
-    found = minimise(Iterate.of(first, RIGID), held, images).place.parameters()
+    found = minimise(Iterate.of(first, RIGID), held, images).iterate.parameters()
     return jax.vmap(Parameters.matrix)(found)
 
 

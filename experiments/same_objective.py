@@ -197,10 +197,10 @@ def main() -> None:
 
     def segment(problems: Problem, starts: Parameters, bound: Array, rounds: Array) -> Segment:
         done = advance(problems, starts, bound, TOLERANCE, TOLERANCE, rounds)
-        return Segment(done.place.parameters(), done.cost, done.settled)
+        return Segment(done.iterate.parameters(), done.cost, done.converged)
 
-    lanes = jnp.zeros(count, jnp.int32)
-    go_on = chunked(segment, problems, starts, per_image, lanes)
+    taken = jnp.zeros(count, jnp.int32)
+    go_on = chunked(segment, problems, starts, per_image, taken)
     here, done, seconds = starts, 0, 0.0
     costs, elapsed, finished = [], [], np.zeros(count, bool)
     for rounds in ROUNDS:

@@ -41,9 +41,9 @@ from convergence_tables import (
     SLACK,
     START_HEADER,
     TOLERANCE_HEADER,
+    computed_iterations,
     curve_rows,
     excess_over,
-    lane_iterations,
     needed,
     plot,
     quantiles,
@@ -139,8 +139,8 @@ def main() -> None:
     found += [run for runs in around.values() for run in runs]
     costs = np.array([stop.cost for stop in found])
     which = np.nanargmin(costs, axis=0)
-    lanes = np.arange(count)
-    best = (costs[which, lanes], np.array([stop.matrix for stop in found])[which, lanes])
+    every = np.arange(count)
+    best = (costs[which, every], np.array([stop.matrix for stop in found])[which, every])
 
     interval = bench.has_interval(tight[THREE_STARTS].parameters)
     loose = bench.bounds >= bench.settings[:, 0]
@@ -156,7 +156,7 @@ def main() -> None:
             rate, reach = rates(*paths[name], limits[name]), needed(*paths[name], best[0])
         took = seconds[name, TOLERANCES[-1]]
         # The iterations of three starts are those of all of them together.
-        per_iteration = took / lane_iterations(stop.iterations) if name in paths else np.nan
+        per_iteration = took / computed_iterations(stop.iterations) if name in paths else np.nan
         rows.append([
             name, *quantiles(stop.iterations), int(stop.iterations.max()),
             int(stop.stopped.sum()), 1e6 * took / count, 1e6 * per_iteration,

@@ -110,9 +110,9 @@ def read_all(folder: Path, study: Grid) -> dict[str, np.ndarray]:
 
 
 def padded_problems(
-    poses: Float[np.ndarray, "lanes n 4 4"],
-    points: Float[np.ndarray, "lanes n 2"],
-    bounds: Float[np.ndarray, "lanes n"] | None = None,
+    poses: Float[np.ndarray, "batch n 4 4"],
+    points: Float[np.ndarray, "batch n 2"],
+    bounds: Float[np.ndarray, "batch n"] | None = None,
 ) -> Problem:
     """Images as a batch of problems, with room for more that are masked.
 

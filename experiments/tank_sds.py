@@ -13,7 +13,7 @@ from hw.bench.tank import Beam, Noise
 from hw.midplane.search import Settings
 from jaxcal import Problem
 from jaxcal.backend import RIGID, Component, Further, ImagePlanes, Observation, minimise
-from jaxcal.model.batch import whole
+from jaxcal.model.batch import pad_images
 from jaxcal.solvers.start import conventional
 
 # The engine's pieces compute in the caller's modes.
@@ -33,8 +33,8 @@ class PlacedOffsets(Observation):
         offset_sd: of every image's offset, mm.
     """
 
-    sigma: Float[Array, "3 lanes"]
-    offset_sd: Float[Array, "lanes n"]
+    sigma: Float[Array, "3 batch"]
+    offset_sd: Float[Array, "batch n"]
 
     def components(self, q: list, further: Further, images: ImagePlanes) -> list[Component]:
         """Errors in the plane, and offsets in their SDs."""
@@ -47,22 +47,22 @@ class PlacedOffsets(Observation):
 
     def padded(self) -> PlacedOffsets:
         """For images that are padded."""
-        return PlacedOffsets(self.sigma, whole(self.offset_sd))
+        return PlacedOffsets(self.sigma, pad_images(self.offset_sd))
 
 
 @jax.jit
 def _minimised(problem: Problem, offset_sd: Array, sigma: Array) -> tuple[Array, Array]:
     images = ImagePlanes.of(problem)
-    begin = conventional(images, RIGID).fit.place
+    begin = conventional(images, RIGID).fit.iterate
     given = jnp.concatenate([sigma.T, jnp.ones((1, sigma.shape[0]))])
-    found = minimise(begin, PlacedOffsets(given, offset_sd), images).place.parameters()
+    found = minimise(begin, PlacedOffsets(given, offset_sd), images).iterate.parameters()
     return found.rotation, found.translation
 
 
 def own_sds(
-    problem: Problem, offset_sd: Float[np.ndarray, "lanes n"], sigma: Float[np.ndarray, "lanes 2"]
-) -> Float[np.ndarray, "lanes 4 4"]:
-    """X of every lane by Gaussian offsets with an SD for each image.
+    problem: Problem, offset_sd: Float[np.ndarray, "batch n"], sigma: Float[np.ndarray, "batch 2"]
+) -> Float[np.ndarray, "batch 4 4"]:
+    """X of every problem by Gaussian offsets with an SD for each image.
 
     Args:
         problem: a batch.

@@ -65,7 +65,7 @@ class TankStudy(Grid):
         status = []
         for name in SETS:
             people = drawn.sets[name]
-            # One person at a time: every call then has as many lanes, and runs one program.
+            # One person at a time: every call then has as many problems, and runs one program.
             batches = [padded_problems(one.poses, one.points) for one in people]
             for arguments in METHODS.values():
                 results = [calibrate_batch(batch, **arguments) for batch in batches]
@@ -108,5 +108,5 @@ def precisions(
 def turns(x: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """Rotation error of every X, rad."""
     return np.array(
-        [[rotation_angle(a, b) for a, b in zip(lane, truth, strict=True)] for lane in x]
+        [[rotation_angle(a, b) for a, b in zip(found, truth, strict=True)] for found in x]
     )

@@ -5,11 +5,13 @@ A calibration in jaxcal is least squares: unknowns that step on a manifold (:cla
 :func:`channel_residual`), a minimiser, and the derivative of the minimum by the implicit function
 theorem. Every method begins at :func:`initial_fit`.
 
-There are versions of these for batches, where arrays are planes with the problems last:
-:class:`ImagePlanes` (the data), :class:`Iterate` (the unknowns), an :class:`Observation`
-(:class:`Points`, :class:`OwnCovariances`, :class:`TrackedPoints`, :class:`InPlane`,
-:class:`BoundedOffsets`, :class:`ChannelDistances`, or one of your own), :func:`accumulate` (the
-normal equations in one pass over the images), :func:`minimise` and :func:`implicit_tangent`.
+For a batch of problems there are :class:`ImagePlanes` (the data), :class:`Iterate` (the unknowns),
+an :class:`Observation` (:class:`Points`, :class:`OwnCovariances`, :class:`TrackedPoints`,
+:class:`InPlane`, :class:`BoundedOffsets`, :class:`ChannelDistances`, or one of your own),
+:func:`accumulate` (the :class:`NormalEquations`, in one pass over the images), :func:`minimise` and
+:func:`implicit_tangent`. A number of every image is a plane (batch, images); the batch axis of all
+other arrays is the last.
+
 :class:`LevenbergMarquardt` is the same loop behind optimistix's interface, for residuals of any
 shape. :func:`arrow_least_squares` is the loop for problems with shared unknowns and one local
 unknown for each row.
@@ -51,9 +53,9 @@ from jaxcal.model.residuals import (
 )
 from jaxcal.model.unknowns import RIGID, Blocks, size
 from jaxcal.solvers.general import LevenbergMarquardt, arrow_least_squares
-from jaxcal.solvers.implicit import optimum as implicit_tangent
+from jaxcal.solvers.implicit import implicit_tangent
 from jaxcal.solvers.levenberg_marquardt import minimise
-from jaxcal.solvers.normal_equations import Normal, accumulate
+from jaxcal.solvers.normal_equations import NormalEquations, accumulate
 from jaxcal.solvers.start import conventional
 
 __all__ = [
@@ -68,7 +70,7 @@ __all__ = [
     "Iterate",
     "LevenbergMarquardt",
     "LocalUnknown",
-    "Normal",
+    "NormalEquations",
     "Observation",
     "OwnCovariances",
     "Parameters",
@@ -112,5 +114,5 @@ def initial_fit(problem: Problem, blocks: Blocks = RIGID) -> Parameters:
 @partial(jax.jit, static_argnums=1)
 def _initial_fit(problem: Problem, blocks: Blocks) -> Parameters:
     images = ImagePlanes.of(jax.tree.map(lambda leaf: leaf[None], problem))
-    found = conventional(images, blocks).fit.place.parameters()
+    found = conventional(images, blocks).fit.iterate.parameters()
     return jax.tree.map(lambda leaf: leaf[0], found)

@@ -23,10 +23,17 @@ from jaxcal.diagnostics.law_words import offset_law
 from jaxcal.model.distributions import FAMILIES, UNIFORM
 from jaxcal.model.shapes import tilted
 from jaxcal.solvers.auto import Answers, median, weights
-from jaxcal.solvers.dense import inverse_lanes_last
+from jaxcal.solvers.dense import inverse_batch_last
 from jaxcal.solvers.expectation_propagation import Marginal, Sites
-from jaxcal.solvers.expectation_propagation import propagate as propagate_lanes_last
-from jaxcal.solvers.offset_mean import LAGS, MEAN_SD, PROBABILITY, believed, gained, trust_in
+from jaxcal.solvers.expectation_propagation import propagate as propagate_batch_last
+from jaxcal.solvers.offset_mean import (
+    LAGS,
+    MEAN_SD,
+    PROBABILITY,
+    log_evidence_gain,
+    mean_belief,
+    trust_in,
+)
 
 DENSITY = {
     "uniform": uniform(-(3**0.5), 2 * 3**0.5).pdf,
@@ -72,7 +79,7 @@ def test_inverse_and_determinant_of_a_positive_matrix():
     matrix = design.T @ design
     sd = np.sqrt(np.diag(matrix))
     both = jnp.stack([jnp.asarray(matrix), -jnp.eye(10)], axis=-1)
-    inverses, determinants = inverse_lanes_last(both)
+    inverses, determinants = inverse_batch_last(both)
     wanted = np.linalg.inv(matrix / np.outer(sd, sd))
     np.testing.assert_allclose(inverses[..., 0] * np.outer(sd, sd), wanted, rtol=1e-9, atol=1e-12)
     assert float(determinants[0]) == pytest.approx(np.linalg.slogdet(matrix)[1], rel=1e-12)
@@ -102,7 +109,7 @@ class Found(NamedTuple):
 
 @partial(jax.jit, static_argnames=("families", "sweeps"))
 def propagate(linear: Linear, families, sd, sweeps: int | None = None) -> Found:
-    """As one lane of the solver's six unknowns, of which the others are seen by no image."""
+    """As a batch of one, in the solver's six unknowns; no image sees those that are added."""
     count = linear.gradient.shape[0]
     more = 6 - count
     more_sweeps = {} if sweeps is None else {"sweeps": sweeps}
@@ -120,7 +127,7 @@ def propagate(linear: Linear, families, sd, sweeps: int | None = None) -> Found:
         [column[None] for column in direction.T], offset[None], linear.used[None], None, None
     )
     squares, pull = direction.T @ direction, direction.T @ offset
-    found = propagate_lanes_last(
+    found = propagate_batch_last(
         known, sites, squares[..., None], pull[:, None], families, sd[:, None], **more_sweeps
     )
     return Found(
@@ -206,9 +213,11 @@ def test_laws_in_turn_settle_where_long_sweeps_do():
 
 
 def answers_of(means: np.ndarray, covariance: np.ndarray, weight: np.ndarray) -> Answers:
-    """Laws' answers, lanes last, all of them numbers."""
-    lanes = jnp.ones(weight.shape[1:], bool)
-    return Answers(*(jnp.asarray(each) for each in (means, covariance, weight, 0 * weight)), lanes)
+    """Laws' answers, batch axis last, all of them numbers."""
+    counted = jnp.ones(weight.shape[1:], bool)
+    return Answers(
+        *(jnp.asarray(each) for each in (means, covariance, weight, 0 * weight)), counted
+    )
 
 
 def test_the_median_is_where_the_expected_distance_is_least():
@@ -228,7 +237,7 @@ def test_the_median_is_where_the_expected_distance_is_least():
     assert abs(float(found[0, 0]) - best) < 0.1 < abs(weight @ means - best)
     about = weight @ (sd**2 + (means - float(found[0, 0])) ** 2)
     assert float(variance[0, 0, 0]) == pytest.approx(about)
-    # Many lanes, any metric: nothing but a law that has all the weight is in the answer, and where
+    # Several problems, any metric: only a law that has all the weight is in the answer, and where
     # none counts there are still numbers.
     root = rng.normal(size=(4, 4))
     squares = np.stack([root @ root.T] * 2, axis=-1)
@@ -239,7 +248,7 @@ def test_the_median_is_where_the_expected_distance_is_least():
     np.testing.assert_allclose(found, means[:, 1] * [1, 0])
 
 
-believed_of = jax.jit(believed)
+believed_of = jax.jit(mean_belief)
 
 
 @pytest.mark.parametrize("trust", [1.0, 0.3])
@@ -271,7 +280,7 @@ def test_the_belief_about_the_mean_is_the_mixtures(trust):
         square = share * moment(2) / with_it
         assert float(found.variance) == pytest.approx(square - expected**2, rel=1e-6)
         gain = np.log(PROBABILITY + (1 - PROBABILITY) * without / with_it)
-        assert float(gained(found)) == pytest.approx(gain, abs=1e-6)
+        assert float(log_evidence_gain(found)) == pytest.approx(gain, abs=1e-6)
 
 
 def test_trust_falls_with_heavy_tails_and_with_errors_alike_in_successive_images():
@@ -310,9 +319,9 @@ def test_a_mean_that_the_edges_deny_is_not_believed():
 
 @pytest.mark.slow
 def test_a_one_sided_law_is_found_and_mended():
-    lanes = [problem(k, images=50, elevation_distribution="one-sided", elevation_mm=5.0,
+    drawn = [problem(k, images=50, elevation_distribution="one-sided", elevation_mm=5.0,
                      noise_mm=0.5) for k in range(8)]  # fmt: skip
-    problems = jaxcal.stack(lanes)
+    problems = jaxcal.stack(drawn)
     auto = jaxcal.calibrate_batch(problems)
     plain = jaxcal.calibrate_batch(problems, prior="gaussian")
     truth = [jaxcal.simulate_recording(

@@ -42,10 +42,10 @@ LONG = [pytest.param(name, marks=pytest.mark.slow) for name in METHODS if name !
 
 
 @pytest.mark.parametrize("name", ["conventional", *LONG])
-def test_a_lane_is_its_problem_and_bad_ones_leave_it_alone(name):
+def test_a_problem_of_a_batch_has_its_own_answer_beside_bad_ones(name):
     good, hard = hard_problems()
     result = jaxcal.calibrate_batch(jaxcal.stack(hard), **METHODS[name]).numpy()
-    # The same program, the last three lanes sound.
+    # The same program, the last three problems sound.
     sound = jaxcal.calibrate_batch(jaxcal.stack([*hard[:3], *good[3:]]), **METHODS[name]).numpy()
     assert result.status.tolist() == [*["converged"] * 3, "unobservable", "failed", "failed"]
     assert sound.status.tolist() == ["converged"] * 6
@@ -54,24 +54,24 @@ def test_a_lane_is_its_problem_and_bad_ones_leave_it_alone(name):
     each = [jaxcal.calibrate(one, **METHODS[name]).numpy() for one in hard[:3]]
     alone = jax.tree.map(lambda *leaves: np.stack(leaves), *each)
     flat = [jax.tree_util.tree_leaves_with_path(each) for each in (result, sound, alone)]
-    for (path, lane), (_, beside), (_, one) in zip(*flat, strict=True):
+    for (path, batched), (_, beside), (_, one) in zip(*flat, strict=True):
         where = jax.tree_util.keystr(path)
-        lane, beside, one = (np.asarray(each)[:3] for each in (lane, beside, one))
-        np.testing.assert_array_equal(lane, beside, err_msg=where)
+        batched, beside, one = (np.asarray(each)[:3] for each in (batched, beside, one))
+        np.testing.assert_array_equal(batched, beside, err_msg=where)
         # One conventional problem has a closed form, without iterations.
         if where.rsplit(".")[-1] in ("iterations", "variance_rounds", "cost", "stationarity"):
             continue
         if where in (".weakest", ".prior_direction"):
             # A direction has no sign.
-            across = np.abs(np.sum(lane * one, axis=-1))
+            across = np.abs(np.sum(batched * one, axis=-1))
             np.testing.assert_allclose(across, np.sum(one**2, axis=-1), atol=1e-6)
             continue
-        if lane.dtype.kind != "f":
-            np.testing.assert_array_equal(lane, one, err_msg=where)
+        if batched.dtype.kind != "f":
+            np.testing.assert_array_equal(batched, one, err_msg=where)
             continue
         # The alternation stops before it is stationary, elsewhere by rounding.
         scale = np.nanmax(np.abs(one), initial=1e-12)
-        np.testing.assert_allclose(lane / scale, one / scale, rtol=0, atol=1e-6, err_msg=where)
+        np.testing.assert_allclose(batched / scale, one / scale, rtol=0, atol=1e-6, err_msg=where)
 
 
 @pytest.mark.slow

@@ -207,13 +207,13 @@ def test_derivative_matches_finite_differences():
 
 
 @pytest.mark.slow
-def test_a_batch_is_its_lanes():
+def test_a_batch_is_its_problems():
     problems = [jaxcal.Problem.from_recording(recording(CURVED, seed=k)) for k in (1, 2, 3)]
     batch = jaxcal.calibrate_batch(jaxcal.stack(problems), prior="gaussian")
-    for lane, problem in enumerate(problems):
+    for k, problem in enumerate(problems):
         alone = jaxcal.calibrate(problem, prior="gaussian")
-        assert angle(batch.image_to_probe[lane], alone.image_to_probe) < 1e-8
-        np.testing.assert_allclose(batch.elevation[lane], alone.elevation, atol=1e-6)
+        assert angle(batch.image_to_probe[k], alone.image_to_probe) < 1e-8
+        np.testing.assert_allclose(batch.elevation[k], alone.elevation, atol=1e-6)
 
 
 @pytest.mark.slow

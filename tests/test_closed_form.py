@@ -394,13 +394,13 @@ def test_batches_give_the_same_answers():
     assert answers.image_to_probe.shape == (3, 4, 4, 4)
     assert answers.scale_mm_per_px is None
     relaxed = 0
-    for lane in range(12):
-        place = divmod(lane, 4)
-        if lane == 3:
+    for number in range(12):
+        place = divmod(number, 4)
+        if number == 3:
             assert not answers.certified[place]
             assert np.isnan(answers.image_to_probe[place]).any()
             continue
-        alone = jaxcal.calibrate_closed_form(jax.tree.map(lambda a, k=lane: a[k], problems))
+        alone = jaxcal.calibrate_closed_form(jax.tree.map(lambda a, k=number: a[k], problems))
         assert answers.certified[place]
         assert answers.unique[place] == alone.unique
         relaxed += not alone.unique

@@ -1,4 +1,4 @@
-"""Compiler flags are wishes: what a compiler does not know is left out, and ends nothing."""
+"""Compiler flags that a compiler does not know are left out, and end nothing."""
 
 from __future__ import annotations
 

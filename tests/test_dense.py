@@ -13,7 +13,7 @@ from jaxcal.solvers import dense
 RANDOM = np.random.default_rng(5)
 
 
-def test_positive_systems_and_a_lane_that_is_not():
+def test_positive_systems_and_one_that_is_not():
     root = RANDOM.normal(size=(6, 9, 9))
     matrix = root @ root.swapaxes(1, 2) + 0.1 * np.eye(9)
     matrix[3] -= 5 * np.eye(9)
@@ -25,7 +25,7 @@ def test_positive_systems_and_a_lane_that_is_not():
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 5, 9, 10, 11])
-def test_swept_matrices_and_a_lane_that_is_not_positive(size: int):
+def test_swept_matrices_and_one_that_is_not_positive(size: int):
     """Blocks of two and three rows, with and without rows added to fill the last block."""
     root = RANDOM.normal(size=(6, size, size + 3))
     matrix = root @ root.swapaxes(1, 2)
@@ -36,8 +36,8 @@ def test_swept_matrices_and_a_lane_that_is_not_positive(size: int):
     vector = RANDOM.normal(size=(6, size))
 
     def solve(matrix, vector):
-        inverse, log_determinant = dense.inverse_lanes_last(matrix)
-        return inverse, log_determinant, dense.solve_lanes_last(matrix, vector)
+        inverse, log_determinant = dense.inverse_batch_last(matrix)
+        return inverse, log_determinant, dense.solve_batch_last(matrix, vector)
 
     got = jax.jit(solve)(jnp.moveaxis(bad, 0, -1), vector.T)
     inverse, log_determinant, solution = (np.moveaxis(np.asarray(part), -1, 0) for part in got)

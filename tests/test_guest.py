@@ -243,9 +243,9 @@ def check_the_documentations_own_observation(names: dict) -> None:
     from jaxcal import backend
 
     fit, problems = names["fit"], names["problems"]
-    assert np.all(fit.settled)
+    assert np.all(fit.converged)
     problem = jax.tree.map(lambda leaf: leaf[0], problems)
-    found = jax.tree.map(lambda leaf: leaf[0], fit.place.parameters())
+    found = jax.tree.map(lambda leaf: leaf[0], fit.iterate.parameters())
     depth = np.asarray(problem.measurements)[:, 1]
     assert float(problem.face_offset) == 0
 
@@ -264,7 +264,7 @@ def check_the_documentations_own_observation(names: dict) -> None:
     @jax.jit
     def solved(lateral):
         moved = replace(images, lateral=lateral)
-        return jnp.sum(backend.minimise(fit.place, names["relative"], moved).place.translation)
+        return jnp.sum(backend.minimise(fit.iterate, names["relative"], moved).iterate.translation)
 
     difference = (solved(images.lateral + step) - solved(images.lateral - step)) / 2e-4
     np.testing.assert_allclose(names["by_lateral"][0, 3], difference, rtol=1e-5)

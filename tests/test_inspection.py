@@ -75,7 +75,7 @@ def scores():
     def fit(errors):
         start, data = jax.vmap(drawn)(errors)
         images, sigma = ImagePlanes.of(data), jnp.tile(SIGMA[:, None], len(errors))
-        return minimise(Iterate.of(start, RIGID), Points(sigma), images).place.parameters(), data
+        return minimise(Iterate.of(start, RIGID), Points(sigma), images).iterate.parameters(), data
 
     def run(errors):
         parameters, data = jax.tree.map(np.asarray, fit(errors))
@@ -117,10 +117,10 @@ def test_few_false_alarms_and_true_ones(scores):
 def test_range_errors_are_judged_by_those_at_their_place():
     """Three wrong images stand out in the middle, while the large errors of corners do not."""
     rng = np.random.default_rng(4)
-    lanes, count = 40, 200
-    x, z = rng.uniform(-25, 25, (lanes, count)), rng.uniform(15, 80, (lanes, count))
+    problems, count = 40, 200
+    x, z = rng.uniform(-25, 25, (problems, count)), rng.uniform(15, 80, (problems, count))
     sd = np.exp(0.8 * (z / 50 - 1) + 0.8 * (x / 25) ** 2)
-    errors = sd * rng.normal(size=(lanes, count))
+    errors = sd * rng.normal(size=(problems, count))
     wrong = slice(0, 3)
     x[:, wrong], z[:, wrong], errors[:, wrong] = 0.0, 40.0, 6.0
     places = np.stack([x, np.zeros_like(x), z], axis=-1)

@@ -37,22 +37,22 @@ moved_to = jax.jit(partial(retract, blocks=RIGID))
 
 @pytest.fixture(scope="module")
 def same_objective():
-    lanes = [
+    sound = [
         replace(problem(k, images=20, elevation_mm=e, noise_mm=s), max_elevation=jnp.full(20, m))
         for k in range(2)
         for e, s, m in SETTINGS
-    ][:14]  # and two that have no answer: the next bucket of lanes is 24
-    lost, too_few = (jax.tree.map(np.array, lanes[0]) for _ in range(2))
+    ][:14]  # and two that have no answer: the next bucket of problems is 24
+    lost, too_few = (jax.tree.map(np.array, sound[0]) for _ in range(2))
     lost.poses[3, 0, 3] = np.nan
     too_few.mask[3:] = 0.0
-    problems = jaxcal.stack([*lanes, lost, too_few])
+    problems = jaxcal.stack([*sound, lost, too_few])
     joint = jaxcal.calibrate_batch(problems, method="joint", prior="bounded").numpy()
     options = Options(tolerance_rad=1e-10, tolerance_mm=1e-10, max_rounds=1500)
     alternation = jaxcal.calibrate_batch(problems, "alternating", options=options).numpy()
     for found in (joint, alternation):
-        assert found.status[len(lanes) :].tolist() == ["failed", "failed"]
-    good = slice(0, len(lanes))
-    return jaxcal.stack(lanes), joint[good], alternation[good]
+        assert found.status[len(sound) :].tolist() == ["failed", "failed"]
+    good = slice(0, len(sound))
+    return jaxcal.stack(sound), joint[good], alternation[good]
 
 
 def test_joint_reaches_the_alternations_objective_at_kkt_precision(same_objective):
@@ -72,22 +72,22 @@ def test_joint_agrees_with_scipy_where_observable(same_objective):
     compared = 0
 
     @jax.jit
-    def residual(unknowns, reference, lane):
+    def residual(unknowns, reference, alone):
         moved = retract(reference, unknowns[:9], RIGID)
-        return circle_residual(moved, unknowns[9:], lane).ravel()
+        return circle_residual(moved, unknowns[9:], alone).ravel()
 
     jacobian = jax.jit(jax.jacfwd(residual))
     for k in range(len(SETTINGS)):
-        lane = jax.tree.map(lambda leaf, k=k: np.asarray(np.asarray(leaf)[k]), problems)
+        alone = jax.tree.map(lambda leaf, k=k: np.asarray(np.asarray(leaf)[k]), problems)
         result = jax.tree.map(lambda leaf, k=k: np.asarray(np.asarray(leaf)[k]), joint)
-        conventional = jaxcal.calibrate(lane, method="conventional").numpy()
+        conventional = jaxcal.calibrate(alone, method="conventional").numpy()
         start = parameters_of(conventional)
-        bound = np.concatenate([np.full(9, np.inf), lane.max_elevation])
-        inside = 0.999 * np.clip(conventional.elevation, -lane.max_elevation, lane.max_elevation)
+        bound = np.concatenate([np.full(9, np.inf), alone.max_elevation])
+        inside = 0.999 * np.clip(conventional.elevation, -alone.max_elevation, alone.max_elevation)
         first = np.concatenate([np.zeros(9), inside])
         fit = least_squares(
-            lambda u, r=start, p=lane: np.asarray(residual(jnp.asarray(u), r, p)), first,
-            lambda u, r=start, p=lane: np.asarray(jacobian(jnp.asarray(u), r, p)),
+            lambda u, r=start, p=alone: np.asarray(residual(jnp.asarray(u), r, p)), first,
+            lambda u, r=start, p=alone: np.asarray(jacobian(jnp.asarray(u), r, p)),
             bounds=(-bound, bound), x_scale="jac", ftol=1e-15, xtol=1e-15, gtol=1e-15,
             max_nfev=2000,
         )  # fmt: skip

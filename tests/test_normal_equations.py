@@ -33,7 +33,7 @@ from jaxcal.model.observations import (
     local_unknowns,
 )
 from jaxcal.model.parameters import Parameters
-from jaxcal.model.unknowns import EXTRA, RIGID
+from jaxcal.model.unknowns import FURTHER, RIGID
 from jaxcal.solvers.levenberg_marquardt import (
     Descent,
     Rounding,
@@ -43,10 +43,10 @@ from jaxcal.solvers.levenberg_marquardt import (
 )
 from jaxcal.solvers.normal_equations import accumulate, component_sums
 
-LANES, IMAGES, ELEMENTS, LEFT_OUT = 3, 11, 5, 4
+PROBLEMS, IMAGES, ELEMENTS, LEFT_OUT = 3, 11, 5, 4
 SIGMA = jnp.asarray(np.outer([0.3, 0.4, 1.5], [1.0, 0.7, 1.3]))
 GATE = jnp.asarray([1.0, 0.0, 1.0])
-"""Second derivatives in two lanes, none in the one between."""
+"""Second derivatives in two problems, none in the one between."""
 
 
 def turns(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
@@ -58,11 +58,11 @@ def turns(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
 def drawn() -> tuple[Problem, Parameters]:
     """Problems, one image left out of each with rubbish in it, and unknowns some mm off."""
     rng = np.random.default_rng(3)
-    rotation, target = turns(rng, (LANES,)), rng.uniform(-50, 50, (LANES, 3))
-    translation = rng.uniform(-30, 30, (LANES, 3))
-    poses = np.tile(np.eye(4), (LANES, IMAGES, 1, 1))
-    poses[..., :3, :3] = turns(rng, (LANES, IMAGES))
-    shape = (LANES, IMAGES)
+    rotation, target = turns(rng, (PROBLEMS,)), rng.uniform(-50, 50, (PROBLEMS, 3))
+    translation = rng.uniform(-30, 30, (PROBLEMS, 3))
+    poses = np.tile(np.eye(4), (PROBLEMS, IMAGES, 1, 1))
+    poses[..., :3, :3] = turns(rng, (PROBLEMS, IMAGES))
+    shape = (PROBLEMS, IMAGES)
     depth = rng.uniform(20, 70, shape)
     q = np.stack([rng.uniform(-25, 25, shape), 1.5 * rng.normal(size=shape), depth], axis=-1)
     in_probe = np.einsum("kij,knj->kni", rotation, q) + translation[:, None]
@@ -81,36 +81,36 @@ def drawn() -> tuple[Problem, Parameters]:
     distances[:, LEFT_OUT] = np.nan
     problems = Problem(
         *(jnp.asarray(v) for v in (poses, points, mask)),
-        spacing=jnp.ones((LANES, 2)),
-        face_offset=jnp.full(LANES, 2.0),
+        spacing=jnp.ones((PROBLEMS, 2)),
+        face_offset=jnp.full(PROBLEMS, 2.0),
         channels=Heard(
-            jnp.asarray(distances), jnp.asarray(heard), jnp.tile(elements, (LANES, 1, 1))
+            jnp.asarray(distances), jnp.asarray(heard), jnp.tile(elements, (PROBLEMS, 1, 1))
         ),
     )
-    small = Rotation.from_rotvec(rng.normal(scale=0.01, size=(LANES, 3))).as_matrix()
+    small = Rotation.from_rotvec(rng.normal(scale=0.01, size=(PROBLEMS, 3))).as_matrix()
     near = Parameters(
         jnp.asarray(rotation @ small),
-        jnp.asarray(translation + rng.normal(scale=0.5, size=(LANES, 3))),
-        jnp.asarray(target + rng.normal(scale=0.5, size=(LANES, 3))),
-        jnp.asarray(rng.uniform(0.98, 1.02, (LANES, 2))),
-        jnp.asarray(rng.uniform(0.98, 1.02, LANES)),
-        jnp.asarray(rng.uniform(-0.5, 0.5, LANES)),
+        jnp.asarray(translation + rng.normal(scale=0.5, size=(PROBLEMS, 3))),
+        jnp.asarray(target + rng.normal(scale=0.5, size=(PROBLEMS, 3))),
+        jnp.asarray(rng.uniform(0.98, 1.02, (PROBLEMS, 2))),
+        jnp.asarray(rng.uniform(0.98, 1.02, PROBLEMS)),
+        jnp.asarray(rng.uniform(-0.5, 0.5, PROBLEMS)),
     )
     return problems, near
 
 
 def shapes() -> jax.Array:
     rng = np.random.default_rng(8)
-    first, second = rng.uniform(0.5, 2.0, (2, LANES, IMAGES))
+    first, second = rng.uniform(0.5, 2.0, (2, PROBLEMS, IMAGES))
     return jnp.asarray(np.stack([first, rng.uniform(-0.4, 0.4, first.shape), second]))
 
 
-OFFSETS = np.random.default_rng(9).normal(size=(LANES, IMAGES))
+OFFSETS = np.random.default_rng(9).normal(size=(PROBLEMS, IMAGES))
 # Images left out have a range of 1 mm; an offset has to fit in there.
 OFFSETS[:, LEFT_OUT] = 0.0
 TAU = jnp.asarray([0.3, 0.2, 0.5])
 
-DIRECTIONS = jnp.asarray(np.random.default_rng(10).normal(size=(3, LANES, IMAGES)))
+DIRECTIONS = jnp.asarray(np.random.default_rng(10).normal(size=(3, PROBLEMS, IMAGES)))
 
 
 class OnLine(Observation):
@@ -121,21 +121,21 @@ class OnLine(Observation):
     oriented: ClassVar[bool] = True
 
     def components(self, q, further, images):
-        assert further.axes is not None
+        assert further.tracker_to_image is not None
         lateral, distance = further.points(images)
-        along = unrolled.apply(further.axes, [*self.direction])
+        along = unrolled.apply(further.tracker_to_image, [*self.direction])
         crossing = [q[k] - q[1] / along[1] * along[k] for k in (0, 2)]
         return [Component([crossing[0] - lateral]), Component([crossing[1] - distance])]
 
 
 CASES = {
-    "points": (lambda images: Points(SIGMA), RIGID + EXTRA),
+    "points": (lambda images: Points(SIGMA), RIGID + FURTHER),
     "own covariances": (
         lambda images: OwnCovariances(SIGMA, shapes(), SIGMA[1] / SIGMA[0]),
         (*RIGID, "scale"),
     ),
     "own covariances, one factor": (
-        lambda images: OwnCovariances(SIGMA[1:], shapes(), jnp.ones(LANES), tied=True),
+        lambda images: OwnCovariances(SIGMA[1:], shapes(), jnp.ones(PROBLEMS), tied=True),
         RIGID,
     ),
     "tracked points": (lambda images: TrackedPoints(SIGMA, TAU), (*RIGID, "scale")),
@@ -149,8 +149,8 @@ CASES = {
         (*RIGID, "scale"),
     ),
     "bounded offsets": (
-        lambda images: BoundedOffsets.of(jnp.full((LANES, IMAGES), 1.2), images),
-        RIGID + EXTRA,
+        lambda images: BoundedOffsets.of(jnp.full((PROBLEMS, IMAGES), 1.2), images),
+        RIGID + FURTHER,
     ),
     "on a line": (lambda images: OnLine(SIGMA[:2], DIRECTIONS), (*RIGID, "scale", "delay")),
     "channels": (lambda images: ChannelDistances(SIGMA[1:]), (*RIGID, "sound-speed", "delay")),
@@ -165,15 +165,15 @@ def case(drawn, name: str) -> tuple[Iterate, Any, ImagePlanes, MediumPrior | Non
     images = ImagePlanes.of(problems, channels=name == "channels")
     medium = None
     if name in ("points", "channels"):
-        medium = MediumPrior(jnp.asarray([[0.01] * LANES, [0.4] * LANES]), blocks)
+        medium = MediumPrior(jnp.asarray([[0.01] * PROBLEMS, [0.4] * PROBLEMS]), blocks)
     return Iterate.of(near, blocks), make(images), images, medium
 
 
 def whitened(step, local, place: Iterate, observation, images: ImagePlanes, medium):
-    """All whitened residuals of every lane after a step, (lanes, n, residuals of an image)."""
+    """All whitened residuals of every problem after a step, (batch, n, residuals of an image)."""
     moved = place.moved(list(step))
     q, axes = targets(moved, images)
-    still = [jnp.zeros((LANES, 1))] * moved.extras.shape[0]
+    still = [jnp.zeros((PROBLEMS, 1))] * moved.further_values.shape[0]
     further = Further.of(moved, still, axes)
     if local is None:
         parts = observation.components(q, further, images)
@@ -183,12 +183,12 @@ def whitened(step, local, place: Iterate, observation, images: ImagePlanes, medi
     for part, sd in zip(parts, observation.sigma, strict=True):
         present = 1.0 if part.present is None else part.present
         for error in part.errors:
-            wide = (present * error).reshape(LANES, IMAGES, -1)
+            wide = (present * error).reshape(PROBLEMS, IMAGES, -1)
             found.append(images.mask[..., None] * wide / sd[:, None, None])
     if medium is not None:
-        speed, delay = moved.extra("sound-speed"), moved.extra("delay")
+        speed, delay = moved.further("sound-speed"), moved.further("delay")
         known = jnp.stack([jnp.log(speed[0]), delay[0]]) / medium.sd
-        found.append(jnp.zeros((LANES, IMAGES, 2)).at[:, 0].set(known.T))
+        found.append(jnp.zeros((PROBLEMS, IMAGES, 2)).at[:, 0].set(known.T))
     return jnp.concatenate(found, axis=-1)
 
 
@@ -197,7 +197,7 @@ def dense(place: Iterate, observation, images: ImagePlanes, medium):
 
     Forward derivatives only: they make the smallest programs.
     """
-    zero, units = jnp.zeros((place.unknowns, LANES)), jnp.eye(place.unknowns)
+    zero, units = jnp.zeros((place.unknowns, PROBLEMS)), jnp.eye(place.unknowns)
 
     def residuals(step, local=None):
         return whitened(step, local, place, observation, images, medium)
@@ -219,7 +219,7 @@ def dense(place: Iterate, observation, images: ImagePlanes, medium):
     local = None
     if isinstance(observation, LocalUnknown):
         q, _ = targets(place, images)
-        still = [jnp.zeros((LANES, 1))] * place.extras.shape[0]
+        still = [jnp.zeros((PROBLEMS, 1))] * place.further_values.shape[0]
         local, free = observation.local(q, Further.of(place, still), images)
     (half, gradient), (_, exact) = along(lambda at: slopes(at, local), zero)
     _, jacobian = along(lambda at: residuals(at, local), zero)
@@ -251,9 +251,9 @@ sums_of = jax.jit(accumulate)
 
 
 def assert_close(found, wanted, tolerance: float) -> None:
-    """To the largest entry of each lane."""
+    """To the largest entry of each problem."""
     wanted = np.asarray(wanted)
-    scale = np.abs(wanted).reshape(-1, LANES).max(axis=0)
+    scale = np.abs(wanted).reshape(-1, PROBLEMS).max(axis=0)
     np.testing.assert_allclose(np.asarray(found) / scale, wanted / scale, rtol=0, atol=tolerance)
 
 
@@ -284,7 +284,7 @@ def test_components_apart_come_to_the_whole(drawn, name):
     @jax.jit
     def apart():
         sums = component_sums(place, observation, images, observation.sigma, medium)
-        return sums, sums.weighed(1 / observation.sigma**2)
+        return sums, sums.weighted(1 / observation.sigma**2)
 
     sums, weighed = jax.tree.map(np.asarray, apart())
     exact, newton = (
@@ -362,8 +362,8 @@ def test_sums_of_planes_have_both_derivatives():
 def test_the_gradient_has_forward_and_reverse_derivatives_by_the_data(drawn):
     place, observation, images, _ = case(drawn, "own covariances")
     rng = np.random.default_rng(1)
-    weight = jnp.asarray(rng.normal(size=(place.unknowns, LANES)))
-    along = jnp.asarray(rng.normal(size=(LANES, IMAGES)))
+    weight = jnp.asarray(rng.normal(size=(place.unknowns, PROBLEMS)))
+    along = jnp.asarray(rng.normal(size=(PROBLEMS, IMAGES)))
 
     def value(lateral):
         data = replace(images, lateral=lateral)
@@ -414,7 +414,7 @@ def test_offsets_are_the_closest_points_of_the_circles(drawn):
 
     @jax.jit
     def looked_at():
-        still = [jnp.zeros((LANES, 1))] * place.extras.shape[0]
+        still = [jnp.zeros((PROBLEMS, 1))] * place.further_values.shape[0]
         distance = Further.of(place, still).points(images)[1]
         return local_unknowns(place, observation, images), targets(place, images)[0], distance
 
@@ -458,14 +458,14 @@ def test_where_the_last_step_was_not_looked_at_the_gradient_is_gone_too(descent)
     normal, gated = (sums_of(place, observation, images, gate) for gate in (None, 0 * GATE))
     for one, other in zip(jax.tree.leaves(normal), jax.tree.leaves(gated), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12 * np.abs(one).max())
-    normal = sums_of(found.place, observation, images, None)
+    normal = sums_of(found.iterate, observation, images, None)
 
     @jax.jit
     def cosine():
-        rounding = Rounding.of(found.place, observation, images)
+        rounding = Rounding.of(found.iterate, observation, images)
         return gradient_cosine(normal, rounding.vanished)
 
-    assert np.all(found.settled)
+    assert np.all(found.converged)
     assert not np.any(found.active)
     assert np.all(found.cosine <= 1e-10)
     assert np.all(np.asarray(cosine()) <= 1e-10)
@@ -473,7 +473,7 @@ def test_where_the_last_step_was_not_looked_at_the_gradient_is_gone_too(descent)
     np.testing.assert_allclose(found.cost, normal.cost, rtol=1e-10)
 
 
-def test_a_lost_lane_leaves_its_neighbours_alone(descent):
+def test_a_lost_problem_leaves_its_neighbours_alone(descent):
     place, observation, images, run = descent
     whole = run(place, observation, images)
     spoilt = replace(images, lateral=images.lateral.at[1, 0].set(jnp.nan))
@@ -493,8 +493,8 @@ def test_a_step_that_fails_is_tried_again_with_more_damping(drawn):
 
     @jax.jit
     def begun():
-        away = place.moved([jnp.full(LANES, float(value)) for value in far])
-        start = Descent.before(away, jnp.zeros(LANES), 1e-9)
+        away = place.moved([jnp.full(PROBLEMS, float(value)) for value in far])
+        start = Descent.before(away, jnp.zeros(PROBLEMS), 1e-9)
         return start, Rounding.of(away, observation, images)
 
     state, rounding = begun()
@@ -514,4 +514,4 @@ def test_a_step_that_fails_is_tried_again_with_more_damping(drawn):
         assert np.all(state.cost[taken] <= before.cost[taken] * (1 + 1e-9))
         failed += int(np.sum(state.retry & state.active))
     assert failed > 0
-    assert np.all(state.settled)
+    assert np.all(state.converged)

@@ -181,7 +181,7 @@ def test_two_thousand_weak_sets_by_the_conventional_method():
     data = together(sets)
     one = jax.jit(lambda p: jaxcal.calibrate(p, "conventional", robust=False))
     each = jax.lax.map(one, data)
-    # A batch descends as one traced problem does, so its slow lanes are those that are slow here.
+    # A batch descends as one traced problem does, so the slow ones here are its slow ones.
     slowest = np.argsort(np.asarray(each.iterations))[-128:]
     hardest = jax.tree.map(lambda leaf: leaf[slowest], data)
     batch = jaxcal.calibrate_batch(hardest, "conventional")
@@ -189,7 +189,7 @@ def test_two_thousand_weak_sets_by_the_conventional_method():
     # The descent may crawl along a flat valley; one problem begins at the closed form.
     unfinished = np.flatnonzero(np.asarray(each.status) == "max_iterations")
     assert len(unfinished) <= len(sets) / 1000
-    for lane in unfinished:
-        alone = jaxcal.calibrate(jax.tree.map(lambda leaf, k=lane: leaf[k], data), "conventional")
+    for k in unfinished:
+        alone = jaxcal.calibrate(jax.tree.map(lambda leaf, k=k: leaf[k], data), "conventional")
         assert alone.status == "converged"
     assert set(each.status) <= {"converged", "unobservable", "max_iterations"}

@@ -37,7 +37,7 @@ def test_draws_do_not_depend_on_the_batch():
     (many, whole), (one, part) = batch(jnp.arange(5)), batch(jnp.array([3]))
     for name in ("turn", "position", "offset"):
         np.testing.assert_array_equal(getattr(many, name)[3], getattr(one, name)[0])
-    # A program for another number of lanes may round what follows differently.
+    # A program for another number of problems may round what follows differently.
     np.testing.assert_allclose(whole.poses[3], part.poses[0], rtol=0, atol=1e-12 * 300)
     np.testing.assert_allclose(whole.points[3], part.points[0], rtol=0, atol=1e-6)
 

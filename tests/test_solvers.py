@@ -142,23 +142,23 @@ def test_any_number_of_images(solver, images):
     [s for s in SOLVERS if s.name not in ("lm", "alternating", "bounded")],
     ids=lambda s: s.name,
 )
-def test_batches_of_any_shape_and_bad_lanes(solver):
+def test_batches_of_any_shape_and_bad_problems(solver):
     """Of the first of the solvers see test_batches.py, of those with bounds test_joint.py."""
-    lanes = [noisy(12, seed) for seed in range(5)]
-    poisoned = replace(lanes[0], poses=np.array(lanes[0].poses))
+    sound = [noisy(12, seed) for seed in range(5)]
+    poisoned = replace(sound[0], poses=np.array(sound[0].poses))
     poisoned.poses[3, 0, 3] = np.nan
-    too_few = replace(lanes[1], mask=(np.arange(12) < 3).astype(float))
-    batch = jaxcal.stack([lanes[0], poisoned, lanes[1], too_few, lanes[2], lanes[3]])
+    too_few = replace(sound[1], mask=(np.arange(12) < 3).astype(float))
+    batch = jaxcal.stack([sound[0], poisoned, sound[1], too_few, sound[2], sound[3]])
     batch = jax.tree.map(lambda leaf: np.asarray(leaf).reshape((2, 3, *leaf.shape[1:])), batch)
     result = jaxcal.calibrate_batch(batch, **solver.arguments, chunk=4).numpy()
     expected = [["converged", "failed", "converged"], ["failed", "converged", "converged"]]
     assert result.status.tolist() == expected
     assert result.image_to_probe.shape == (2, 3, 4, 4)
     assert np.isfinite(np.asarray(result.image_to_probe)[result.status == "converged"]).all()
-    alone = jaxcal.calibrate(lanes[2], **solver.arguments)
-    lane = jax.tree.map(lambda leaf: leaf[1, 1], result)
-    assert_same(lane, alone, solver.agreement)
-    np.testing.assert_allclose(lane.covariance, alone.covariance, rtol=1e-3)
+    alone = jaxcal.calibrate(sound[2], **solver.arguments)
+    third = jax.tree.map(lambda leaf: leaf[1, 1], result)
+    assert_same(third, alone, solver.agreement)
+    np.testing.assert_allclose(third.covariance, alone.covariance, rtol=1e-3)
 
 
 def of_channels() -> jaxcal.Problem:

@@ -26,7 +26,7 @@ from jaxcal.study import load_spec, open_results, run_study
 from jaxcal.study.laws import OFFSET_LAWS
 from jaxcal.study.offsets import nominal_bound, standard_deviation, standard_offsets
 from jaxcal.study.pipeline import (
-    LANES,
+    BATCH_SIZE,
     Block,
     _block,
     _trials,
@@ -283,7 +283,7 @@ def test_a_trial_is_that_of_the_public_functions(finished):
     data = open_results(finished)
     cell, trial = 1, 7
     condition = spec.condition(cell)
-    indices = cell * spec.trials + np.arange(LANES["cpu"])
+    indices = cell * spec.trials + np.arange(BATCH_SIZE["cpu"])
     block = by_public_functions(spec, condition, indices)
     experiment, problem = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[trial]), block)
     result = jaxcal.calibrate(problem, "conventional")
@@ -596,7 +596,7 @@ def test_full_file_system(long_study, tmp_path):
 @pytest.mark.slow
 def test_several_devices_share_a_block(tmp_path):
     """More trials than one device takes at a time, so that both have some of each chunk."""
-    trials = LANES["cpu"] + 6
+    trials = BATCH_SIZE["cpu"] + 6
     spec = conventional_only(small(trials, chunk=trials))
     path, folder = tmp_path / "spec.toml", tmp_path / "out"
     path.write_text(spec)
@@ -681,12 +681,12 @@ def blocks(text):
 def test_pieces_go_through_a_program_one_by_one_in_order():
     devices = tuple(jax.local_devices())[:1]
     each = compile_pieces(lambda one, other, factor: factor * one + other, devices, pieces=2)
-    pieces, lanes = _block(parse_spec(small(trials=200, chunk=150)), devices)
-    assert (pieces, lanes) == (3, LANES["cpu"])
-    trials = np.arange(pieces * lanes * 2.0)
-    cut = trials.reshape(pieces, lanes, 2)
+    pieces, size = _block(parse_spec(small(trials=200, chunk=150)), devices)
+    assert (pieces, size) == (3, BATCH_SIZE["cpu"])
+    trials = np.arange(pieces * size * 2.0)
+    cut = trials.reshape(pieces, size, 2)
     np.testing.assert_array_equal(
-        _trials(each(cut, -cut, 3.0)), 2 * trials.reshape(pieces * lanes, 2)
+        _trials(each(cut, -cut, 3.0)), 2 * trials.reshape(pieces * size, 2)
     )
 
 
@@ -696,7 +696,7 @@ def test_what_a_study_computes_is_what_calibrations_say():
     Parallel poses leave X open: no status says otherwise. The conventional method is that of
     :func:`test_a_trial_is_that_of_the_public_functions`.
     """
-    text = small(trials=LANES["cpu"]) + SELF_TUNED
+    text = small(trials=BATCH_SIZE["cpu"]) + SELF_TUNED
     text = text.replace("[conditions]", "[conditions]\nrotation_deg = [0, 30]")
     text = text.replace("elevation_mm = [0.5, 2]", "elevation_mm = 2")
     for k, (spec, block, whole) in enumerate(blocks(text)):

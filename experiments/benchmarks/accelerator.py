@@ -74,8 +74,8 @@ def main() -> None:
     for images in IMAGES:
         problems = drawn(images)
         there = jax.device_put(problems, accelerator)
-        mesh = jax.sharding.Mesh(np.array(processor), ("lanes",))
-        spread = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("lanes"))
+        mesh = jax.sharding.Mesh(np.array(processor), ("batch",))
+        spread = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("batch"))
         here = jax.device_put(jax.tree.map(lambda leaf: leaf[:FEW], problems), spread)
         for method, prior in METHODS:
             first, fast, x, failed = timed(there, method, prior)

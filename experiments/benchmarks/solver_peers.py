@@ -55,7 +55,7 @@ SEED = 20261125
 SIGMA_MM = public_calls.SIGMA
 AGREEMENT = 1e-8
 ELEVATION_MM, NOISE_MM = 2.0, 2.0
-IMAGES, LANES = 50, 64
+IMAGES, BATCH_SIZE = 50, 64
 JUDGED = 512
 """Answers of each solver that are judged."""
 
@@ -117,21 +117,21 @@ class Minimiser:
     @classmethod
     def of(cls, batch: Batch) -> Minimiser:
         """Compile, with the flags that jaxcal compiles its own batches with."""
-        lanes = min(LANES, len(batch))
-        if len(batch) % lanes:
-            raise ValueError(f"{len(batch)} problems are no multiple of {lanes}")
+        size = min(BATCH_SIZE, len(batch))
+        if len(batch) % size:
+            raise ValueError(f"{len(batch)} problems are no multiple of {size}")
 
         def solve(part: tuple) -> tuple:
             problems, matrix, point = part
             start = jax.vmap(Parameters.of)(matrix[:, :3, :3], matrix[:, :3, 3], point)
-            points = Points(jnp.tile(jnp.asarray(SIGMA_MM)[:, None], lanes))
+            points = Points(jnp.tile(jnp.asarray(SIGMA_MM)[:, None], size))
             fit = minimise(Iterate.of(start, RIGID), points, ImagePlanes.of(problems))
-            found = fit.place.parameters()
+            found = fit.iterate.parameters()
             return jax.vmap(Parameters.matrix)(found), found.point, fit.iterations
 
         def whole(*parts):
             def split(leaf):
-                return leaf.reshape(-1, lanes, *leaf.shape[1:])
+                return leaf.reshape(-1, size, *leaf.shape[1:])
 
             done = jax.lax.map(solve, jax.tree.map(split, parts))
             return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), done)

@@ -30,10 +30,10 @@ from jaxcal.model.batch import ImagePlanes, Iterate, barrier, targets
 from jaxcal.model.distributions import OffsetLaw
 from jaxcal.model.parameters import Parameters
 from jaxcal.model.thresholds import LARGEST_ELEVATION, MINIMUM_SELF_TUNING
-from jaxcal.model.unknowns import EXTRA, TABLE, Blocks, block_slice, measured, size
+from jaxcal.model.unknowns import FURTHER, TABLE, Blocks, block_slice, measured, size
 from jaxcal.result.calibration import Calibration, Linearisation, Medium, Status
 from jaxcal.solvers.convergence import Convergence
-from jaxcal.solvers.dense import inverse_lanes_last
+from jaxcal.solvers.dense import inverse_batch_last
 from jaxcal.solvers.plan import Given, SolvePlan
 
 LEAST_GAP_MM = 1e-6
@@ -69,7 +69,7 @@ class Solved(eqx.Module):
 
 
 class Average(eqx.Module):
-    """The average over the offsets' laws, problems first.
+    """The average over the offsets' laws; batch axis first.
 
     Attributes:
         covariance: of the unknowns.
@@ -77,8 +77,8 @@ class Average(eqx.Module):
         law: the result about the distribution of the offsets.
     """
 
-    covariance: Float[Array, "lanes p p"]
-    elevation_sd: Float[Array, "lanes n"]
+    covariance: Float[Array, "batch p p"]
+    elevation_sd: Float[Array, "batch n"]
     law: OffsetLaw
 
 
@@ -103,7 +103,7 @@ def assemble(
     """
     problem = problem.cleared(problem.mask)
     # Without this barrier the compiler would repeat the end of the solve for every image. The
-    # matrices stay without, so that they are not moved from lanes last and back.
+    # matrices stay outside it: it would move their batch axis to the front, and back again.
     parts = (solved.parameters, solved.offset, solved.sigma, solved.bound, solved.convergence)
     parameters, offset, sigma, bound, convergence = barrier(parts)
     information, design = solved.information, solved.design
@@ -178,12 +178,12 @@ def assemble(
 
 def _further(parameters: Parameters, blocks: Blocks) -> Float[Array, "*batch k"] | None:
     """The free ones of the further unknowns, in one array; None where there are none."""
-    free = [parameters.further(name) for name in EXTRA if name in blocks]
+    free = [parameters.further(name) for name in FURTHER if name in blocks]
     return jnp.concatenate(free, axis=-1) if free else None
 
 
 class Errors(eqx.Module):
-    """The target in every image, and what was measured; arrays are (lanes, n).
+    """The target in every image, and what was measured; arrays are (batch, n).
 
     Attributes:
         q: lateral, elevational and axial coordinate of the target, mm; (0, 0, 1) where left out.
@@ -204,7 +204,7 @@ class Errors(eqx.Module):
         q, _ = targets(Iterate.of(parameters, blocks), images)
         further = {
             name: [values[..., k, None] for k in range(TABLE[name].size)]
-            for name, values in ((name, parameters.further(name)) for name in EXTRA)
+            for name, values in ((name, parameters.further(name)) for name in FURTHER)
         }
         lateral, distance = measured(images.lateral, images.axial, images.face[:, None], further)
         # The range has no derivative at 0, and an image left out may put the target there.
@@ -283,48 +283,48 @@ class Observability(eqx.Module):
         singular: degenerate, or the information with the active bounds is singular.
     """
 
-    degenerate: Bool[Array, " lanes"]
-    weak: Bool[Array, " lanes"]
-    singular: Bool[Array, " lanes"]
+    degenerate: Bool[Array, " batch"]
+    weak: Bool[Array, " batch"]
+    singular: Bool[Array, " batch"]
 
 
 def covariance_and_observability(
-    information: Float[Array, "p p lanes"],
-    design: Float[Array, "p p lanes"],
-    variance: Float[Array, " lanes"],
-    scale: Float[Array, "p lanes"],
-    reach: Float[Array, " lanes"],
+    information: Float[Array, "p p batch"],
+    design: Float[Array, "p p batch"],
+    variance: Float[Array, " batch"],
+    scale: Float[Array, "p batch"],
+    largest_sd: Float[Array, " batch"],
     *,
     bounded: bool = False,
-) -> tuple[Float[Array, "p p lanes"], Observability]:
-    """Covariance (NaN where there is none) and observability, by one elimination; lanes last.
+) -> tuple[Float[Array, "p p batch"], Observability]:
+    """Covariance (NaN where there is none) and observability, by one elimination; batch axis last.
 
     Args:
         information: of the unknowns, offsets eliminated.
         design: of the unweighted residuals, offsets known.
         variance: of the residuals from which ``information`` was formed.
         scale: factors that turn every unknown's tangent into mm at the target.
-        reach: largest useful SD of a direction, mm.
+        largest_sd: largest useful SD of a direction, mm.
         bounded: bounds confine the offsets, and with them every direction, so all that matters
             about the information is whether it is singular.
     """
-    lanes, eps = variance.shape[0], float(jnp.finfo(scale.dtype).eps)
+    count, eps = variance.shape[0], float(jnp.finfo(scale.dtype).eps)
     eye = jnp.eye(len(scale), dtype=scale.dtype)[..., None]
     both = scale[:, None] * scale
     weighted, unweighted = jax.lax.stop_gradient((information / both, design / both))
     total = jnp.trace(weighted)
-    least = threshold(eps) * total if bounded else jax.lax.stop_gradient(variance / reach**2)
+    least = threshold(eps) * total if bounded else jax.lax.stop_gradient(variance / largest_sd**2)
     floor = threshold(eps) * jnp.trace(unweighted)
     # A ridge at the level of rounding keeps an unobservable direction finite.
     ridge = jax.lax.stop_gradient(16 * eps * (design if bounded else information) * eye)
     # A pivot that is not positive makes the logarithm of the determinant not finite.
     matrices = [information + ridge, unweighted - floor * eye]
-    inverse, log_determinant = inverse_lanes_last(jnp.concatenate(matrices, axis=-1))
-    inverse = inverse[..., :lanes]
-    observable = jnp.isfinite(log_determinant[lanes:])
+    inverse, log_determinant = inverse_batch_last(jnp.concatenate(matrices, axis=-1))
+    inverse = inverse[..., :count]
+    observable = jnp.isfinite(log_determinant[count:])
 
-    def exceeding() -> Bool[Array, " lanes"]:
-        return jnp.isfinite(inverse_lanes_last(weighted - least * eye)[1])
+    def exceeding() -> Bool[Array, " batch"]:
+        return jnp.isfinite(inverse_batch_last(weighted - least * eye)[1])
 
     # No eigenvalue of an inverse exceeds its trace; this test nearly always suffices.
     largest = jnp.sum(jnp.diagonal(inverse).T * scale**2, axis=0)
@@ -451,7 +451,7 @@ def _medium(
     blocks, speed = plan.blocks, problem.nominal_sound_speed
     found: dict[str, Array | None] = {}
 
-    def believed(which: int) -> Array | None:
+    def prior_sd(which: int) -> Array | None:
         sd = given.medium_sd
         return None if sd is None else jnp.broadcast_to(sd[which], speed.shape)
 
@@ -460,11 +460,11 @@ def _medium(
         estimate = speed * parameters.sound_speed
         found["sound_speed_m_s"] = estimate
         found["sound_speed_sd_m_s"] = estimate * jnp.sqrt(covariance[..., at, at])
-        found["sound_speed_prior_m_s"] = believed(0)
+        found["sound_speed_prior_m_s"] = prior_sd(0)
     if "delay" in blocks:
         at = block_slice(blocks, "delay").start
         before = 0.0 if problem.delay is None else problem.delay
         found["delay_s"] = before + parameters.delay / (1e3 * speed)
         found["delay_sd_s"] = jnp.sqrt(covariance[..., at, at]) / (1e3 * speed)
-        found["delay_prior_s"] = believed(1)
+        found["delay_prior_s"] = prior_sd(1)
     return Medium(**found) if found else None

@@ -24,7 +24,7 @@ from jaxcal.calibration.serial_correlation import widened
 from jaxcal.data.problem import Problem, as_batch, as_problem, check_shapes, check_values
 from jaxcal.data.recording import MINIMUM_IMAGES, Recording
 from jaxcal.model.distributions import Shape
-from jaxcal.model.unknowns import EXTRA, MEDIUM, RIGID
+from jaxcal.model.unknowns import FURTHER, MEDIUM, RIGID
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import AnyArray, Array
 from jaxcal.runtime.arrays import array_module, is_traced
@@ -66,7 +66,7 @@ ALTERNATION = ("tolerance_rad", "tolerance_mm", "max_rounds", "inner_steps")
 """The options that the alternation alone has."""
 
 LARGEST_CHUNK = 2**31 - 1
-"""Most lanes that can be asked for side by side."""
+"""Largest ``chunk``: problems solved side by side."""
 
 P = ParamSpec("P")
 
@@ -367,7 +367,7 @@ def prepare(
         # Plain numbers become numpy arrays, since JAX would compile their conversion.
         return None if value is None else array_module(value).asarray(value, dtype)
 
-    blocks = RIGID + tuple(name for name in EXTRA if name in request.estimate)
+    blocks = RIGID + tuple(name for name in FURTHER if name in request.estimate)
     medium = None
     if kind == "gaussian" and any(name in blocks for name in MEDIUM):
         believed = (request.sound_speed_sd, request.delay_sd)
@@ -432,8 +432,8 @@ def _check_names(request: Request) -> None:
             raise InputError(f"{name} must be one of {listed}, not {shown(value)}")
     check_flag("robust", request.robust)
     for name in request.estimate:
-        if name not in EXTRA:
-            raise InputError(f"cannot estimate {shown(name)}; there are: {', '.join(EXTRA)}")
+        if name not in FURTHER:
+            raise InputError(f"cannot estimate {shown(name)}; there are: {', '.join(FURTHER)}")
 
 
 def _check_combination(request: Request, kind: Prior) -> None:

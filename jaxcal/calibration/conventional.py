@@ -19,7 +19,7 @@ import numpy as np
 from jaxcal.data.problem import Problem
 from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns
 from jaxcal.diagnostics.uncertainty import LARGEST_SD, inverses, mm_at_target, threshold
-from jaxcal.model.unknowns import EXTRA, block_slice, size
+from jaxcal.model.unknowns import FURTHER, block_slice, size
 from jaxcal.result.calibration import Calibration, Linearisation, Medium, Status
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.arrays import map_arrays
@@ -44,7 +44,7 @@ def closed_form_answer(problem: Problem, plan: SolvePlan) -> Calibration | None:
     """
     options = plan.options
     asked = options.solver == "lm" and not plan.robust
-    estimate = tuple(name for name in EXTRA if name in plan.blocks)
+    estimate = tuple(name for name in FURTHER if name in plan.blocks)
     if not asked or options.precision != "float64" or estimate not in CONSTRAINTS:
         return None
     problem = map_arrays(np.asarray, replace(problem, channels=None))
@@ -81,7 +81,7 @@ def _with_uncertainty(found: ClosedForm, problem: Problem, plan: SolvePlan) -> C
     if weak:
         covariance = np.full_like(covariance, np.nan)
 
-    parts = [unknowns.further[name] for name in EXTRA if name in blocks]
+    parts = [unknowns.further[name] for name in FURTHER if name in blocks]
     further = [part[0] for block in parts for part in block]
     gradient = np.abs(errors @ rows)
     length = np.sqrt(np.diag(information) * objective)

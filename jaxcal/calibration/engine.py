@@ -183,7 +183,7 @@ def _solve_chunks_kept(
         "jaxcal.calibration.programs:solve_some_chunks",
         (padded, given, np.asarray(pieces, np.int32)),
         (plan, chunk),
-        flags=compiler.batch_wishes(),
+        flags=compiler.batch_flags(),
         label=label,
         hold=partial(_kept_as_jax_holds, problem=problems) if done else executables.in_numpy,
     )
@@ -208,11 +208,11 @@ def _solve_chunks_compiled(
         pieces = -(-pieces // len(devices)) * len(devices)
     else:
         devices = devices[:1]
-    lanes = max(-(-count // pieces), 1)
-    if count and pieces * lanes != count:
-        rows = jnp.arange(pieces * lanes) % count
+    size = max(-(-count // pieces), 1)
+    if count and pieces * size != count:
+        rows = jnp.arange(pieces * size) % count
         problems = jax.tree.map(lambda leaf: leaf[rows], problems)
-    return programs.chunks(devices, alone)(problems, given, plan, lanes)
+    return programs.chunks(devices, alone)(problems, given, plan, size)
 
 
 def _label(plan: SolvePlan, images: int) -> dict[str, Any]:

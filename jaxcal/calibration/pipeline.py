@@ -32,7 +32,7 @@ def solve_problems(
     problems: Problem,
     given: Given,
     plan: SolvePlan,
-    agreed: Float[Array, "lanes n"] | None = None,
+    agreed: Float[Array, "batch n"] | None = None,
     begun: ConventionalStart | GivenStart | None = None,
 ) -> Calibration:
     """Solve a batch of problems (one leading axis).
@@ -97,11 +97,11 @@ def _solved(
     found = methods.solve(problems, images, given, plan, begun)
     observation = found.observation
     information, design = barrier(_normal_matrices(found, images))
-    offset = jnp.zeros((images.lanes, 0), images.mask.dtype)
+    offset = jnp.zeros((images.batch_size, 0), images.mask.dtype)
     if isinstance(observation, LocalUnknown):
-        offset = local_unknowns(found.place, observation, images)
+        offset = local_unknowns(found.iterate, observation, images)
     solved = Solved(
-        parameters=found.place.parameters(),
+        parameters=found.iterate.parameters(),
         offset=offset,
         sigma=observation.sigma.T if observation.whitened else None,
         bound=observation.bound if isinstance(observation, BoundedOffsets) else None,
@@ -117,13 +117,13 @@ def _solved(
 
 def _normal_matrices(
     found: Solution, images: ImagePlanes
-) -> tuple[Float[Array, "p p lanes"], Float[Array, "p p lanes"]]:
+) -> tuple[Float[Array, "p p batch"], Float[Array, "p p batch"]]:
     """The weighted normal matrix at a solution, and that of the unweighted components."""
-    observation, place = found.observation, found.place
+    observation, iterate = found.observation, found.iterate
     geometry = observation.geometry(images)
     if geometry is observation and observation.whitened:
-        return information_and_design(place, observation, images, found.medium)
-    weighted = accumulate(place, observation, images, None, found.medium).stacked()
+        return information_and_design(iterate, observation, images, found.medium)
+    weighted = accumulate(iterate, observation, images, None, found.medium).stacked()
     if geometry is observation:
         return weighted, weighted
-    return weighted, accumulate(place, geometry, images, None).stacked()
+    return weighted, accumulate(iterate, geometry, images, None).stacked()

@@ -64,8 +64,8 @@ def orthonormal_pair(
     return half * (plus + minus), half * (plus - minus)
 
 
-def chord_angle(difference: Float[Array, "3 3 *lanes"]) -> Float[Array, "*lanes"]:
-    """Angle (rad) between two rotations, from their difference; lanes last.
+def chord_angle(difference: Float[Array, "3 3 *batch"]) -> Float[Array, "*batch"]:
+    """Angle (rad) between two rotations, from their difference; batch axes last.
 
     2 asin(|R1 - R2| / sqrt 8) keeps its digits near zero, where acos of the trace loses half
     of them.

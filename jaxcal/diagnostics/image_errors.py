@@ -190,10 +190,10 @@ class ImageErrors:
         far = np.linalg.norm(apart, axis=-1)
         further = self.unknowns.along(2)
         # The derivative by the distance is a complex step, too.
-        gain = np.imag(model.heard(far + 1j * TINY, further)) / TINY
+        gain = np.imag(model.predicted_distance(far + 1j * TINY, further)) / TINY
         rows = (gain / far)[..., None] * (apart @ motion(self.q, self.turned, self.blocks))
         for column, (change,) in further_derivatives(
-            lambda values: [model.heard(far, values)], further, self.blocks
+            lambda values: [model.predicted_distance(far, values)], further, self.blocks
         ):
             rows[..., column] = change
         weight = self.mask[..., None] * np.nan_to_num(np.asarray(channels.heard))

@@ -37,7 +37,7 @@ from jaxcal.diagnostics.image_errors import (
     quadratic,
 )
 from jaxcal.diagnostics.uncertainty import inverses
-from jaxcal.model.unknowns import heard
+from jaxcal.model.unknowns import predicted_distance
 from jaxcal.runtime.array_types import Bool, Float, Int
 from jaxcal.runtime.arrays import map_arrays
 from jaxcal.solvers.plan import TUNED
@@ -229,7 +229,7 @@ def _on_channels(answer: Calibration, seen: ImageErrors, used: Array) -> _Errors
     elements = np.asarray(channels.elements)[0]
     rows = rows.reshape(len(used), len(elements), -1)[used] / element_sd
     far = np.linalg.norm(seen.q[0][used, None] - elements, axis=-1)
-    model = heard(far[None], seen.unknowns.along(2))[0]
+    model = predicted_distance(far[None], seen.unknowns.along(2))[0]
     listened = np.nan_to_num(np.asarray(channels.heard))[0][used]
     measured = np.nan_to_num(np.asarray(channels.distances))[0][used]
     errors = np.where(listened > 0, model - measured, 0.0) / element_sd

@@ -1,8 +1,8 @@
 """A batch of problems as planes: the one place where data change their layout.
 
-Public arrays have the problems first and small matrices last. The solvers want the opposite: one
-plane (lanes, images) for every number of an image, and everything else with the lanes last, so
-that XLA vectorises over images and over problems. A *lane* is one problem of a batch.
+Public arrays have the batch axis first and small matrices last. The solvers want the opposite, so
+that XLA vectorises over images and over problems: every number of an image is a *plane*, an array
+(batch, images), and all other arrays have the batch axis last.
 
 Tracker poses are B_i = (R_i, b_i), X = (R, t), the target is c, and q_i = X^-1 B_i^-1 c is the
 target in image i's frame.
@@ -20,7 +20,7 @@ from jaxcal import InputError
 from jaxcal.data.problem import Problem
 from jaxcal.model import unrolled
 from jaxcal.model.parameters import Parameters
-from jaxcal.model.unknowns import EXTRA, Blocks, block_slice, size, step_between, stepped
+from jaxcal.model.unknowns import FURTHER, Blocks, block_slice, size, step_between, stepped
 from jaxcal.model.unrolled import Matrix, Vector
 
 _CROSS_PLACES = np.array([[0, 2, 1], [2, 0, 0], [1, 0, 0]])
@@ -32,7 +32,7 @@ RIGID_UNKNOWNS = 9
 
 
 class ElementPlanes(eqx.Module):
-    """What every element heard.
+    """The times of flight, as distances.
 
     Attributes:
         distances: one-way distances at the nominal sound speed and delay, mm.
@@ -40,30 +40,30 @@ class ElementPlanes(eqx.Module):
         elements: positions in the image frame [lateral, elevational, axial], mm.
     """
 
-    distances: Float[Array, "lanes n elements"]
-    heard: Float[Array, "lanes n elements"]
-    elements: Float[Array, "3 lanes elements"]
+    distances: Float[Array, "batch n elements"]
+    heard: Float[Array, "batch n elements"]
+    elements: Float[Array, "3 batch elements"]
 
 
 class ImagePlanes(eqx.Module):
-    """What was measured, one plane (lanes, images) for every number.
+    """What was measured, one plane (batch, images) for every number.
 
     Attributes:
-        rotation: R_i by rows.
-        origin: b_i, mm.
-        lateral: lateral position at the nominal scale, mm.
-        axial: range from pixel row 0 at the nominal scale, mm.
+        rotation: R_i, from the probe's frame to the tracker's: entry (j, k) at index 3 j + k.
+        origin: b_i, the probe's origin in the tracker's frame, mm.
+        lateral: lateral position of the target's image at the nominal scale, mm.
+        axial: its range from pixel row 0 at the nominal scale, mm.
         face: range of pixel row 0, mm.
-        mask: 1 for used images; the others hold harmless numbers.
+        mask: 1 for used images; the others hold finite values without meaning.
         channels: the times of flight, or None.
     """
 
-    rotation: Float[Array, "9 lanes n"]
-    origin: Float[Array, "3 lanes n"]
-    lateral: Float[Array, "lanes n"]
-    axial: Float[Array, "lanes n"]
-    face: Float[Array, " lanes"]
-    mask: Float[Array, "lanes n"]
+    rotation: Float[Array, "9 batch n"]
+    origin: Float[Array, "3 batch n"]
+    lateral: Float[Array, "batch n"]
+    axial: Float[Array, "batch n"]
+    face: Float[Array, " batch"]
+    mask: Float[Array, "batch n"]
     channels: ElementPlanes | None = None
 
     @classmethod
@@ -72,7 +72,7 @@ class ImagePlanes(eqx.Module):
 
         Args:
             problems: the batch.
-            channels: take the times of flight along.
+            channels: include the times of flight.
 
         Raises:
             InputError: one problem, or a batch with more axes.
@@ -88,7 +88,7 @@ class ImagePlanes(eqx.Module):
             return jnp.where(used, values, jnp.asarray(instead, problems.mask.dtype))
 
         points = problems.measurements * problems.spacing[:, None, :]
-        # Turned round all at once: entry by entry, every plane would read all of the poses.
+        # Transposed all at once: entry by entry, every plane would read all of the poses.
         entries = problems.poses.reshape(*problems.mask.shape, 16)
         entries = barrier(jnp.moveaxis(entries, -1, 0)).reshape(4, 4, *problems.mask.shape)
         rotation = [plane(entries[i, j], float(i == j)) for i in range(3) for j in range(3)]
@@ -111,31 +111,31 @@ class ImagePlanes(eqx.Module):
         )
 
     @property
-    def distance(self) -> Float[Array, "lanes n"]:
+    def distance(self) -> Float[Array, "batch n"]:
         """Range at the nominal scale, sound speed and delay, mm."""
         return self.axial + self.face[:, None]
 
     @property
-    def used(self) -> Float[Array, " lanes"]:
+    def used(self) -> Float[Array, " batch"]:
         """Number of used images."""
         return jnp.sum(self.mask, axis=1)
 
     def padded(self) -> ImagePlanes:
-        """With unused images added up to whole vectors, so that loops have no remainder."""
+        """With unused images added up to whole 64-byte vectors, so that loops have no remainder."""
         if self.channels is not None:
             return self
-        added = whole(self.mask).shape[1] - self.mask.shape[1]
+        added = pad_images(self.mask).shape[1] - self.mask.shape[1]
         return ImagePlanes(
-            whole(self.rotation),
-            whole(self.origin),
-            whole(self.lateral),
-            whole(self.axial),
+            pad_images(self.rotation),
+            pad_images(self.origin),
+            pad_images(self.lateral),
+            pad_images(self.axial),
             self.face,
             jnp.pad(self.mask, [(0, 0), (0, added)]),
         )
 
     def repeated(self, times: int) -> ImagePlanes:
-        """The same points (no times of flight) in ``times`` times the lanes."""
+        """The same points (no times of flight), the whole batch ``times`` times over."""
         return ImagePlanes(
             jnp.tile(self.rotation, (1, times, 1)),
             jnp.tile(self.origin, (1, times, 1)),
@@ -146,26 +146,27 @@ class ImagePlanes(eqx.Module):
         )
 
     @property
-    def lanes(self) -> int:
+    def batch_size(self) -> int:
         """Number of problems."""
         return self.mask.shape[0]
 
 
 class Iterate(eqx.Module):
-    """A value of every lane's unknowns, lanes last.
+    """A value of the unknowns of every problem of a batch; the batch axis is last.
 
     Attributes:
-        rotation: of X.
-        translation: of X, mm.
-        point: c, mm.
-        extras: components of the free further unknowns, in the order of the blocks.
+        rotation: of X, from the image's frame to the probe's.
+        translation: of X: the image's origin in the probe's frame, mm.
+        point: the target c in the tracker's frame, mm.
+        further_values: components of the free further unknowns, in the order of the blocks: factors
+            on scale and sound speed, delay in mm.
         blocks: which unknowns are free (static).
     """
 
-    rotation: Float[Array, "3 3 lanes"]
-    translation: Float[Array, "3 lanes"]
-    point: Float[Array, "3 lanes"]
-    extras: Float[Array, "extras lanes"]
+    rotation: Float[Array, "3 3 batch"]
+    translation: Float[Array, "3 batch"]
+    point: Float[Array, "3 batch"]
+    further_values: Float[Array, "further batch"]
     blocks: Blocks = eqx.field(static=True)
 
     @classmethod
@@ -181,57 +182,57 @@ class Iterate(eqx.Module):
                 f"target of these has the shape {parameters.point.shape}"
             )
         none = jnp.zeros((0, parameters.point.shape[0]), parameters.point.dtype)
-        free = [parameters.further(name).T for name in EXTRA if name in blocks]
-        extras = jnp.concatenate([none, *free])
+        free = [parameters.further(name).T for name in FURTHER if name in blocks]
+        values = jnp.concatenate([none, *free])
         rotation = jnp.moveaxis(parameters.rotation, 0, -1)
-        return cls(rotation, parameters.translation.T, parameters.point.T, extras, blocks)
+        return cls(rotation, parameters.translation.T, parameters.point.T, values, blocks)
 
     @property
     def unknowns(self) -> int:
-        """How many unknowns a lane has."""
+        """Number of unknowns of one problem."""
         return size(self.blocks)
 
-    def extra(self, name: str) -> Float[Array, "k lanes"] | None:
-        """The values of a further unknown, or None where it is not free."""
+    def further(self, name: str) -> Float[Array, "k batch"] | None:
+        """The values of a further unknown, one row for each component; None if it is not free."""
         if name not in self.blocks:
             return None
         at = block_slice(self.blocks, name)
-        return self.extras[at.start - RIGID_UNKNOWNS : at.stop - RIGID_UNKNOWNS]
+        return self.further_values[at.start - RIGID_UNKNOWNS : at.stop - RIGID_UNKNOWNS]
 
     def parameters(self) -> Parameters:
-        """The parameters, with a leading axis; what is not free is nominal."""
+        """The parameters, batch axis first; unknowns that are not free are nominal."""
         rotation = jnp.moveaxis(self.rotation, -1, 0)
         found = jax.vmap(Parameters.of)(rotation, self.translation.T, self.point.T)
-        free = {name: self.extra(name) for name in EXTRA}
+        free = {name: self.further(name) for name in FURTHER}
         return found.with_further(
             {name: value.T for name, value in free.items() if value is not None}
         )
 
-    def moved(self, step: Float[Array, "p lanes"] | Vector) -> Iterate:
+    def moved(self, step: Float[Array, "p batch"] | Vector) -> Iterate:
         """The iterate after a step: :func:`jaxcal.model.parameters.retract` to second order.
 
         It turns by Cayley's rotation, which is a rotation for any step and needs no sine.
         """
         if isinstance(step, list):
             step = jnp.stack(step)
-        extras = self.extras
+        values = self.further_values
         if self.unknowns > RIGID_UNKNOWNS:
             at = RIGID_UNKNOWNS
             parts = []
-            for value, name in zip(extras, _extra_names(self.blocks), strict=True):
+            for value, name in zip(values, _further_names(self.blocks), strict=True):
                 parts.append(stepped(name, value, step[at], jnp.exp))
                 at += 1
-            extras = jnp.stack(parts)
+            values = jnp.stack(parts)
         turn = _cayley(step[3:6])
         return Iterate(
             jnp.sum(self.rotation[:, :, None] * turn, axis=1),
             self.translation + jnp.sum(self.rotation * step[:3], axis=1),
             self.point + step[6:RIGID_UNKNOWNS],
-            extras,
+            values,
             self.blocks,
         )
 
-    def step_to(self, other: Iterate) -> Float[Array, "p lanes"]:
+    def step_to(self, other: Iterate) -> Float[Array, "p batch"]:
         """The step that :meth:`moved` takes to get from here to another iterate."""
         back = jnp.swapaxes(self.rotation, 0, 1)
         turn = jnp.sum(back[:, :, None] * other.rotation[None], axis=1)
@@ -241,14 +242,14 @@ class Iterate(eqx.Module):
         along = jnp.sum(back * (other.translation - self.translation), axis=1)
         parts = [along, 2 * axis / (1 + turn[0, 0] + turn[1, 1] + turn[2, 2])]
         parts.append(other.point - self.point)
-        names = _extra_names(self.blocks)
-        for here, there, name in zip(self.extras, other.extras, names, strict=True):
+        names = _further_names(self.blocks)
+        for here, there, name in zip(self.further_values, other.further_values, names, strict=True):
             parts.append(step_between(name, here, there, jnp.log)[None])
         return jnp.concatenate(parts)
 
 
-def _cayley(vector: Float[Array, "3 lanes"]) -> Float[Array, "3 3 lanes"]:
-    """:func:`jaxcal.model.unrolled.rotation` of vectors, lanes last."""
+def _cayley(vector: Float[Array, "3 batch"]) -> Float[Array, "3 3 batch"]:
+    """:func:`jaxcal.model.unrolled.rotation` of vectors; batch axis last."""
     half = 0.5 * vector
     square = jnp.sum(half * half, axis=0)
     cross = picked(half, _CROSS_PLACES) * _CROSS_SIGNS.astype(half.dtype)
@@ -264,14 +265,14 @@ def picked(array: Float[Array, "k ..."], places: np.ndarray) -> Float[Array, "*p
     return array.at[places.astype(np.uint32)].get(mode="promise_in_bounds")
 
 
-def _extra_names(blocks: Blocks) -> list[str]:
+def _further_names(blocks: Blocks) -> list[str]:
     """The block of every further unknown, in order."""
-    return [name for name in EXTRA if name in blocks for _ in range(size((name,)))]
+    return [name for name in FURTHER if name in blocks for _ in range(size((name,)))]
 
 
 @jax.jit
 def targets(iterate: Iterate, images: ImagePlanes) -> tuple[Vector, Matrix]:
-    """q_i, and its derivative M_i = R' R_i' by the target, as planes."""
+    """q_i (mm, in image i's frame), and its derivative M_i = R' R_i' by the target, as planes."""
     rotation, translation = iterate.rotation[..., None], iterate.translation[..., None]
     inverse = [[rotation[k, a] for k in range(3)] for a in range(3)]
     back = [[images.rotation[3 * j + i] for j in range(3)] for i in range(3)]
@@ -284,13 +285,13 @@ def targets(iterate: Iterate, images: ImagePlanes) -> tuple[Vector, Matrix]:
     return unrolled.apply(inverse, in_probe), unrolled.product(inverse, back)
 
 
-def choose(which: Bool[Array, "*lanes"], first, second):
-    """For every lane, one of two pytrees whose last axis counts the lanes."""
+def choose(which: Bool[Array, "*batch"], first, second):
+    """One of two pytrees for every problem; their leaves have the batch axis last."""
     return jax.tree.map(lambda a, b: jnp.where(which, a, b), first, second)
 
 
 def barrier(values):
-    """Keep XLA from fusing across here: it would compute a lane's values again for every image."""
+    """Keep XLA from fusing across here: it would recompute a problem's values for every image."""
     return jax.lax.optimization_barrier(values)
 
 
@@ -328,7 +329,7 @@ def total(planes: Vector) -> Vector:
     return [zero if unrolled.is_zero(plane) else next(found) for plane in planes]
 
 
-def whole(planes: Float[Array, "*planes n"]) -> Float[Array, "*planes padded"]:
+def pad_images(planes: Float[Array, "*planes n"]) -> Float[Array, "*planes padded"]:
     """Planes padded with their last image, up to whole vectors of 64 bytes."""
     extra = -planes.shape[-1] % (64 // planes.dtype.itemsize)
     return jnp.pad(planes, [(0, 0)] * (planes.ndim - 1) + [(0, extra)], mode="edge")

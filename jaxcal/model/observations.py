@@ -35,16 +35,16 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxcal import InputError
-from jaxcal.model.batch import RIGID_UNKNOWNS, ImagePlanes, Iterate, targets, whole
+from jaxcal.model.batch import RIGID_UNKNOWNS, ImagePlanes, Iterate, pad_images, targets
 from jaxcal.model.thresholds import LARGEST_ELEVATION
 from jaxcal.model.unknowns import (
-    EXTRA,
+    FURTHER,
     MEDIUM,
     TABLE,
     Blocks,
     block_slice,
-    heard,
     measured,
+    predicted_distance,
     step_between,
     stepped,
 )
@@ -56,23 +56,26 @@ TRACKER_STEPS = 4
 
 
 class Further(eqx.Module):
-    """What an image sees beside q: the free further unknowns, and where the tracker's axes point.
+    """What residuals may depend on beside q: the free further unknowns, and the rotation M_i.
 
     Attributes:
-        values: by name (:mod:`jaxcal.model.unknowns`), a plane (lanes, 1) for each component.
-        axes: M_i = R' R_i', which turns directions in the tracker's frame into the image's; it
-            may be None where no observation is :attr:`Observation.oriented`.
+        values: by name (:mod:`jaxcal.model.unknowns`), a plane (batch, 1) for each component.
+        tracker_to_image: M_i = R' R_i', the rotation of directions from the tracker's frame to the
+            image's, three rows of three planes (batch, n); None unless the observation is
+            :attr:`Observation.oriented`.
     """
 
     values: dict[str, Vector]
-    axes: Matrix | None = None
+    tracker_to_image: Matrix | None = None
 
     @classmethod
-    def of(cls, iterate: Iterate, tangent: Vector, axes: Matrix | None = None) -> Further:
+    def of(
+        cls, iterate: Iterate, tangent: Vector, tracker_to_image: Matrix | None = None
+    ) -> Further:
         """The iterate's further unknowns, moved by a step, and the tracker's axes."""
         values = {}
-        for name in EXTRA:
-            components = iterate.extra(name)
+        for name in FURTHER:
+            components = iterate.further(name)
             if components is not None:
                 at = block_slice(iterate.blocks, name)
                 steps = tangent[at.start - RIGID_UNKNOWNS : at.stop - RIGID_UNKNOWNS]
@@ -80,29 +83,29 @@ class Further(eqx.Module):
                     stepped(name, value[:, None], step, jnp.exp)
                     for value, step in zip(components, steps, strict=True)
                 ]
-        return cls(values, axes)
+        return cls(values, tracker_to_image)
 
     @classmethod
-    def at(cls, iterate: Iterate, axes: Matrix | None = None) -> Further:
+    def at(cls, iterate: Iterate, tracker_to_image: Matrix | None = None) -> Further:
         """The iterate's further unknowns as they are."""
         still = jnp.zeros_like(iterate.point[0])[:, None]
-        return cls.of(iterate, [still] * iterate.extras.shape[0], axes)
+        return cls.of(iterate, [still] * iterate.further_values.shape[0], tracker_to_image)
 
     def points(self, images: ImagePlanes) -> tuple[Array, Array]:
         """Lateral position and range of every image, mm."""
         return measured(images.lateral, images.axial, images.face[:, None], self.values)
 
-    def heard(self, distance: Array) -> Array:
-        """What elements measure of targets at distances (lanes, n, elements), mm."""
+    def predicted_distance(self, distance: Array) -> Array:
+        """What elements would measure of targets at distances (batch, n, elements), mm."""
         planes = {name: [v[..., None] for v in value] for name, value in self.values.items()}
-        return heard(distance, planes)
+        return predicted_distance(distance, planes)
 
 
 class Component(eqx.Module):
     """Residual planes that share one SD.
 
     Attributes:
-        errors: planes (lanes, n), or (lanes, n, elements), mm.
+        errors: planes (batch, n), or (batch, n, elements), mm.
         present: 1 where there is a residual, in addition to the images' mask; None: everywhere.
     """
 
@@ -120,56 +123,66 @@ class Observation(eqx.Module):
         InputError: an SD that is not positive; inf stands for nothing known.
     """
 
-    sigma: eqx.AbstractVar[Float[Array, "components lanes"]]
+    sigma: eqx.AbstractVar[Float[Array, "components batch"]]
     whitened: ClassVar[bool] = True
-    """Whether residuals are in SDs; otherwise their variance is estimated from them."""
+    """Whether residuals are divided by their SDs; else their variance is estimated from them."""
     oriented: ClassVar[bool] = False
-    """Whether residuals depend on how the image is turned in other ways than through q."""
+    """Whether residuals depend on the image's orientation other than through q."""
 
     def __check_init__(self) -> None:
         _check_values("sigma", self.sigma)
 
     @abc.abstractmethod
     def components(self, q: Vector, further: Further, images: ImagePlanes) -> list[Component]:
-        """Residuals of every image; one entry for each SD."""
+        """The residuals of every image.
 
-    def count(self, images: ImagePlanes) -> Float[Array, "components lanes"]:
+        Args:
+            q: the target in every image's frame [lateral, elevational, axial], mm: three planes
+                (batch, n).
+            further: the free further unknowns; for an ``oriented`` observation also M_i.
+            images: the data.
+
+        Returns:
+            One component for each SD in ``sigma``, in the same order.
+        """
+
+    def count(self, images: ImagePlanes) -> Float[Array, "components batch"]:
         """How many residuals each component has."""
         return jnp.broadcast_to(images.used, self.sigma.shape)
 
-    def with_sigma(self, sigma: Float[Array, "components lanes"]) -> Observation:
+    def with_sigma(self, sigma: Float[Array, "components batch"]) -> Observation:
         """The same with other SDs."""
         return eqx.tree_at(lambda observation: observation.sigma, self, sigma)
 
-    def largest_weight(self) -> Float[Array, " lanes"]:
+    def largest_weight(self) -> Float[Array, " batch"]:
         """Largest change of a whitened residual for a mm of error, 1/mm."""
         return 1 / jnp.min(self.sigma, axis=0)
 
     def geometry(self, images: ImagePlanes) -> Observation:
-        """What shows which unknowns the poses determine, by its residuals without their SDs."""
+        """The observation whose unweighted residuals show which unknowns the poses determine."""
         del images
         return self
 
     def padded(self) -> Observation:
-        """The same for images that are padded."""
+        """The same for images padded by :meth:`ImagePlanes.padded`."""
         return self
 
-    def in_units(self, sigma: Float[Array, "components lanes"]) -> Observation:
-        """The same for tuning, with residuals in the units that the present SDs set."""
+    def in_units(self, sigma: Float[Array, "components batch"]) -> Observation:
+        """The same, with residuals formed with these SDs where they depend on the ratio of SDs."""
         del sigma
         return self
 
     def growth(
         self,
-        before: Float[Array, "components lanes"],
-        now: Float[Array, "components lanes"],
-        squares: Float[Array, "components lanes"],
-    ) -> Float[Array, " lanes"] | float:
-        """How much half the cost can have grown only because the residuals' units changed.
+        before: Float[Array, "components batch"],
+        now: Float[Array, "components batch"],
+        squares: Float[Array, "components batch"],
+    ) -> Float[Array, " batch"] | float:
+        """Largest growth of half the cost that is due to :meth:`in_units` alone, not to a step.
 
         Args:
-            before: the SDs that gave the residuals their units before.
-            now: the SDs that give them their units now.
+            before: the SDs with which the residuals were formed before.
+            now: the SDs with which they are formed now.
             squares: of the whitened residuals, summed over the images.
         """
         del before, now, squares
@@ -192,7 +205,7 @@ class Points(Observation):
         sigma: SDs of lateral position, range and offset, mm.
     """
 
-    sigma: Float[Array, "3 lanes"]
+    sigma: Float[Array, "3 batch"]
 
     def components(self, q: Vector, further: Further, images: ImagePlanes) -> list[Component]:
         lateral, distance = errors(q, further, images)
@@ -206,7 +219,7 @@ def errors(q: Vector, further: Further, images: ImagePlanes) -> tuple[Array, Arr
     return q[0] - lateral, square * jax.lax.rsqrt(square) - distance
 
 
-def factor_of(shape: Float[Array, "3 lanes n"]) -> tuple[Array, Array, Array]:
+def factor_of(shape: Float[Array, "3 batch n"]) -> tuple[Array, Array, Array]:
     """Cholesky factors of 2x2 matrices: first, off-diagonal and last entry."""
     first = jnp.sqrt(shape[0])
     mixed = shape[1] / first
@@ -225,9 +238,9 @@ class OwnCovariances(Observation):
         tied: whether one factor is the SD of both measurements (static).
     """
 
-    sigma: Float[Array, "components lanes"]
-    shape: Float[Array, "3 lanes n"]
-    ratio: Float[Array, " lanes"]
+    sigma: Float[Array, "components batch"]
+    shape: Float[Array, "3 batch n"]
+    ratio: Float[Array, " batch"]
     tied: bool = eqx.field(static=True, default=False)
 
     def components(self, q: Vector, further: Further, images: ImagePlanes) -> list[Component]:
@@ -240,11 +253,11 @@ class OwnCovariances(Observation):
             return [Component([one, other]), Component([q[1]])]
         return [Component([one]), Component([other]), Component([q[1]])]
 
-    def count(self, images: ImagePlanes) -> Float[Array, "components lanes"]:
+    def count(self, images: ImagePlanes) -> Float[Array, "components batch"]:
         used = images.used
         return jnp.stack([2 * used, used] if self.tied else [used] * 3)
 
-    def in_units(self, sigma: Float[Array, "components lanes"]) -> OwnCovariances:
+    def in_units(self, sigma: Float[Array, "components batch"]) -> OwnCovariances:
         if self.tied:
             return self
         ratio = sigma[1] / sigma[0]
@@ -254,10 +267,10 @@ class OwnCovariances(Observation):
 
     def growth(
         self,
-        before: Float[Array, "components lanes"],
-        now: Float[Array, "components lanes"],
-        squares: Float[Array, "components lanes"],
-    ) -> Float[Array, " lanes"] | float:
+        before: Float[Array, "components batch"],
+        now: Float[Array, "components batch"],
+        squares: Float[Array, "components batch"],
+    ) -> Float[Array, " batch"] | float:
         if self.tied:
             return 0.0
         # The second residual contains at most this share of the first; then Cauchy-Schwarz.
@@ -269,24 +282,24 @@ class OwnCovariances(Observation):
         growth = change * part * jnp.sqrt(squares[0] * squares[1])
         return jnp.where(part > 0, growth, 0.0)
 
-    def with_sigma(self, sigma: Float[Array, "components lanes"]) -> Observation:
+    def with_sigma(self, sigma: Float[Array, "components batch"]) -> Observation:
         return super().with_sigma(sigma).in_units(sigma)
 
     def geometry(self, images: ImagePlanes) -> Observation:
         return InPlane.of(images)
 
     def padded(self) -> OwnCovariances:
-        return eqx.tree_at(lambda o: o.shape, self, whole(self.shape))
+        return eqx.tree_at(lambda o: o.shape, self, pad_images(self.shape))
 
 
-def variance_planes(covariance: Float[Array, "lanes n 2 2"]) -> Float[Array, "3 lanes n"]:
+def variance_planes(covariance: Float[Array, "batch n 2 2"]) -> Float[Array, "3 batch n"]:
     """Lateral variance, covariance and range variance as planes."""
     return jnp.stack([covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 1, 1]])
 
 
 def unit_shape(
-    variances: Float[Array, "3 lanes n"], images: ImagePlanes
-) -> tuple[Float[Array, "3 lanes n"], Float[Array, "2 lanes"]]:
+    variances: Float[Array, "3 batch n"], images: ImagePlanes
+) -> tuple[Float[Array, "3 batch n"], Float[Array, "2 batch"]]:
     """Covariances scaled so that the used images' mean variances are 1, and those means, mm^2.
 
     Covariances of zero (exact data) have no shape: they become unit matrices of mean 1.
@@ -313,7 +326,7 @@ class ChannelDistances(Observation):
         sigma: SDs of an element's distance and of the offset, mm.
     """
 
-    sigma: Float[Array, "2 lanes"]
+    sigma: Float[Array, "2 batch"]
 
     def components(self, q: Vector, further: Further, images: ImagePlanes) -> list[Component]:
         channels = images.channels
@@ -322,17 +335,17 @@ class ChannelDistances(Observation):
         square = 0.0
         for value, element in zip(q, channels.elements, strict=True):
             square = square + (value[..., None] - element[:, None, :]) ** 2
-        exact = further.heard(jnp.sqrt(square))
+        exact = further.predicted_distance(jnp.sqrt(square))
         return [Component([exact - channels.distances], channels.heard), Component([q[1]])]
 
-    def count(self, images: ImagePlanes) -> Float[Array, "2 lanes"]:
+    def count(self, images: ImagePlanes) -> Float[Array, "2 batch"]:
         assert images.channels is not None
         heard = jnp.sum(images.mask[..., None] * images.channels.heard, axis=(1, 2))
         return jnp.stack([heard, images.used])
 
 
-def _unit(images: ImagePlanes) -> Float[Array, "1 lanes"]:
-    return jnp.ones((1, images.lanes), images.mask.dtype)
+def _unit(images: ImagePlanes) -> Float[Array, "1 batch"]:
+    return jnp.ones((1, images.batch_size), images.mask.dtype)
 
 
 def on_circle(q: Vector, y: Array, further: Further, images: ImagePlanes) -> Vector:
@@ -348,7 +361,7 @@ class InPlane(Observation):
         sigma: one.
     """
 
-    sigma: Float[Array, "1 lanes"]
+    sigma: Float[Array, "1 batch"]
     whitened: ClassVar[bool] = False
 
     @classmethod
@@ -366,15 +379,15 @@ class HeldOffsets(Observation):
 
     Attributes:
         sigma: one.
-        offset: y, mm.
+        offset: y_i, mm.
     """
 
-    sigma: Float[Array, "1 lanes"]
-    offset: Float[Array, "lanes n"]
+    sigma: Float[Array, "1 batch"]
+    offset: Float[Array, "batch n"]
     whitened: ClassVar[bool] = False
 
     @classmethod
-    def of(cls, offset: Float[Array, "lanes n"], images: ImagePlanes) -> HeldOffsets:
+    def of(cls, offset: Float[Array, "batch n"], images: ImagePlanes) -> HeldOffsets:
         """For these images."""
         return cls(_unit(images), offset)
 
@@ -383,7 +396,7 @@ class HeldOffsets(Observation):
 
     def padded(self) -> HeldOffsets:
         # A padded image's range is that of the last one, and so is its offset.
-        return eqx.tree_at(lambda o: o.offset, self, whole(self.offset))
+        return eqx.tree_at(lambda o: o.offset, self, pad_images(self.offset))
 
 
 class LocalUnknown(Observation):
@@ -391,13 +404,16 @@ class LocalUnknown(Observation):
 
     @abc.abstractmethod
     def local(self, q: Vector, further: Further, images: ImagePlanes) -> tuple[Array, Array]:
-        """The best value for given q, and 1 where it may move (0 where it rests on a bound)."""
+        """The image's own unknown at its best for given q, and 1 where it is free (0 on a bound).
+
+        Both are planes (batch, n). The arguments are those of :meth:`Observation.components`.
+        """
 
     @abc.abstractmethod
     def components_at(
         self, q: Vector, local: Array, further: Further, images: ImagePlanes
     ) -> list[Component]:
-        """:meth:`components` at a value of that unknown."""
+        """:meth:`Observation.components` at a value of the image's own unknown."""
 
     def components(self, q: Vector, further: Further, images: ImagePlanes) -> list[Component]:
         return self.components_at(q, self.local(q, further, images)[0], further, images)
@@ -408,10 +424,10 @@ class LocalUnknown(Observation):
 
 def local_unknowns(
     iterate: Iterate, observation: LocalUnknown, images: ImagePlanes
-) -> Float[Array, "lanes n"]:
+) -> Float[Array, "batch n"]:
     """Every image's own unknown at its best; 0 for images left out."""
-    q, axes = targets(iterate, images)
-    return images.mask * observation.local(q, Further.at(iterate, axes), images)[0]
+    q, tracker_to_image = targets(iterate, images)
+    return images.mask * observation.local(q, Further.at(iterate, tracker_to_image), images)[0]
 
 
 class BoundedOffsets(LocalUnknown):
@@ -425,15 +441,15 @@ class BoundedOffsets(LocalUnknown):
         InputError: a bound below zero.
     """
 
-    sigma: Float[Array, "1 lanes"]
-    bound: Float[Array, "lanes n"]
+    sigma: Float[Array, "1 batch"]
+    bound: Float[Array, "batch n"]
     whitened: ClassVar[bool] = False
 
     def __check_init__(self) -> None:
         _check_values("bound", self.bound, zero=True)
 
     @classmethod
-    def of(cls, bound: Float[Array, "lanes n"], images: ImagePlanes) -> BoundedOffsets:
+    def of(cls, bound: Float[Array, "batch n"], images: ImagePlanes) -> BoundedOffsets:
         """For these images."""
         return cls(_unit(images), bound)
 
@@ -461,7 +477,7 @@ class BoundedOffsets(LocalUnknown):
         return [Component(on_circle(q, local, further, images))]
 
     def padded(self) -> BoundedOffsets:
-        return eqx.tree_at(lambda o: o.bound, self, whole(self.bound))
+        return eqx.tree_at(lambda o: o.bound, self, pad_images(self.bound))
 
 
 class TrackedPoints(LocalUnknown):
@@ -481,9 +497,9 @@ class TrackedPoints(LocalUnknown):
         InputError: an SD that is not positive, or a ``tracker_sd`` below zero.
     """
 
-    sigma: Float[Array, "3 lanes"]
-    tracker_sd: Float[Array, " lanes"]
-    shape: Float[Array, "3 lanes n"] | None = None
+    sigma: Float[Array, "3 batch"]
+    tracker_sd: Float[Array, " batch"]
+    shape: Float[Array, "3 batch n"] | None = None
 
     def __check_init__(self) -> None:
         _check_values("tracker_sd", self.tracker_sd, zero=True)
@@ -536,29 +552,29 @@ class TrackedPoints(LocalUnknown):
     def padded(self) -> TrackedPoints:
         if self.shape is None:
             return self
-        return eqx.tree_at(lambda o: o.shape, self, whole(self.shape))
+        return eqx.tree_at(lambda o: o.shape, self, pad_images(self.shape))
 
 
 class MediumPrior(eqx.Module):
-    """What is known of sound speed and delay before the data are seen.
+    """The prior of sound speed and delay: Gaussian, about their nominal values.
 
     Attributes:
-        sd: of the sound speed (relative) and of the delay (mm) about their nominal values.
+        sd: prior SDs of the sound speed (relative) and of the delay (mm).
         blocks: the free unknowns (static).
     """
 
-    sd: Float[Array, "2 lanes"]
+    sd: Float[Array, "2 batch"]
     blocks: Blocks = eqx.field(static=True)
 
     def repeated(self, times: int) -> MediumPrior:
-        """The same in ``times`` times the lanes."""
+        """The same, the whole batch ``times`` times over."""
         return MediumPrior(jnp.tile(self.sd, (1, times)), self.blocks)
 
     def deviations(self, iterate: Iterate) -> list[tuple[int, Array, Array]]:
         """Index, deviation from nominal and precision of sound speed and delay, where free."""
         found = []
         for name, sd in zip(MEDIUM, self.sd, strict=True):
-            value = iterate.extra(name)
+            value = iterate.further(name)
             if value is not None:
                 away = step_between(name, TABLE[name].nominal, value[0], jnp.log)
                 found.append((block_slice(self.blocks, name).start, away, 1 / (sd * sd)))

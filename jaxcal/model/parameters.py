@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from jaxcal import InputError
 from jaxcal.data.geometry import matrix_from_rotation, rotation_from_vector
-from jaxcal.model.unknowns import EXTRA, TABLE, Blocks, block_slice, size, stepped
+from jaxcal.model.unknowns import FURTHER, TABLE, Blocks, block_slice, size, stepped
 
 
 class Parameters(eqx.Module):
@@ -73,7 +73,14 @@ class Parameters(eqx.Module):
 
 
 def retract(parameters: Parameters, tangent: Float[Array, " p"], blocks: Blocks) -> Parameters:
-    """Move parameters by a tangent vector (mm, rad, mm, log units; in the order of ``blocks``).
+    """Move parameters by a tangent vector: X by the right perturbation X Exp([v, omega]).
+
+    Args:
+        parameters: of one problem.
+        tangent: in the order of ``blocks``: v (mm, along the image's axes), omega (rad, about
+            them), the step of the target (mm, tracker's frame), steps of the logarithms of scale
+            and sound speed, the step of the delay (mm).
+        blocks: the unknowns that move.
 
     Raises:
         InputError: as many numbers as the blocks have unknowns are needed.
@@ -102,7 +109,7 @@ def retract(parameters: Parameters, tangent: Float[Array, " p"], blocks: Blocks)
     return moved.with_further(
         {
             name: stepped(name, parameters.further(name), part(name), jnp.exp)
-            for name in EXTRA
+            for name in FURTHER
             if name in blocks
         }
     )

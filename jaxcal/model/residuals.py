@@ -1,7 +1,7 @@
 """The residuals of one problem, as arrays with one row an image.
 
 They are the residuals of :mod:`jaxcal.model.observations` in the layout of public arrays, for
-callers with a solver of their own and for the few places that take one problem at a time. Images
+callers with a solver of their own and for code that takes one problem at a time. Images
 left out give zeros.
 """
 
@@ -16,16 +16,16 @@ from jaxcal.data.problem import Problem
 from jaxcal.model.batch import ImagePlanes, Iterate, targets
 from jaxcal.model.observations import ChannelDistances, Further, Points, on_circle
 from jaxcal.model.parameters import Parameters
-from jaxcal.model.unknowns import EXTRA, RIGID
+from jaxcal.model.unknowns import FURTHER, RIGID
 
 
-def _one_lane(
+def _batch_of_one(
     parameters: Parameters, problem: Problem, *, channels: bool = False
 ) -> tuple[ImagePlanes, Further, list[Array]]:
-    """The images, the further unknowns and q of one problem as planes of one lane."""
+    """The images, the further unknowns and q of one problem, as planes of a batch of one."""
     alone = jax.tree.map(lambda leaf: leaf[None], (parameters, problem))
     images = ImagePlanes.of(alone[1], channels=channels)
-    iterate = Iterate.of(alone[0], RIGID + EXTRA)
+    iterate = Iterate.of(alone[0], RIGID + FURTHER)
     return images, Further.at(iterate), targets(iterate, images)[0]
 
 
@@ -36,7 +36,7 @@ def measured_points(parameters: Parameters, problem: Problem) -> Float[Array, "n
         parameters: X, target and further unknowns.
         problem: the data.
     """
-    images, further, _ = _one_lane(parameters, problem)
+    images, further, _ = _batch_of_one(parameters, problem)
     return jnp.stack([plane[0] for plane in further.points(images)], axis=1)
 
 
@@ -47,7 +47,7 @@ def target_in_image(parameters: Parameters, problem: Problem) -> Float[Array, "n
         parameters: X, target and further unknowns.
         problem: the data.
     """
-    q = jnp.stack([plane[0] for plane in _one_lane(parameters, problem)[2]], axis=1)
+    q = jnp.stack([plane[0] for plane in _batch_of_one(parameters, problem)[2]], axis=1)
     unused = jnp.asarray([0.0, 0.0, 1.0], q.dtype)
     return jnp.where(problem.mask[:, None] > 0, q, unused)
 
@@ -69,7 +69,7 @@ def circle_residual(
         raise InputError(
             f"elevation must have shape {problem.mask.shape}, not {jnp.shape(elevation)}"
         )
-    images, further, q = _one_lane(parameters, problem)
+    images, further, q = _batch_of_one(parameters, problem)
     return _rows(on_circle(q, elevation[None], further, images), problem)
 
 
@@ -80,7 +80,7 @@ def measurement_residual(parameters: Parameters, problem: Problem) -> Float[Arra
         parameters: X, target and further unknowns.
         problem: the data.
     """
-    images, further, q = _one_lane(parameters, problem)
+    images, further, q = _batch_of_one(parameters, problem)
     unit = Points(jnp.ones((3, 1), problem.mask.dtype))
     found = unit.components(q, further, images)
     return _rows([component.errors[0] for component in found], problem)
@@ -93,7 +93,7 @@ def channel_residual(parameters: Parameters, problem: Problem) -> Float[Array, "
         parameters: X, target and further unknowns.
         problem: the data, with channels.
     """
-    images, further, q = _one_lane(parameters, problem, channels=True)
+    images, further, q = _batch_of_one(parameters, problem, channels=True)
     unit = ChannelDistances(jnp.ones((2, 1), problem.mask.dtype))
     distances = unit.components(q, further, images)[0]
     present = 1.0 if distances.present is None else distances.present[0]

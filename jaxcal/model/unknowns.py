@@ -1,9 +1,9 @@
 """The unknowns other than the offsets: a table with a row for each. Needs no JAX.
 
 X and the target are those of Eq. 7. *Further* unknowns convert what was measured to mm:
-:func:`measured` and :func:`heard` define how, in arithmetic that numpy, JAX and complex numbers
-share. All other code that depends on an unknown (steps, derivatives, names, words) reads this
-table. A new unknown needs a row, a line in :func:`measured`, and a field in
+:func:`measured` and :func:`predicted_distance` define how, in arithmetic that numpy, JAX and
+complex numbers share. All other code that depends on an unknown (steps, derivatives, names, words)
+reads this table. A new unknown needs a row, a line in :func:`measured`, and a field in
 :class:`jaxcal.model.parameters.Parameters`.
 """
 
@@ -128,7 +128,7 @@ TABLE = {
 RIGID: Blocks = ("translation", "rotation", "point")
 """The unknowns of Eq. 7: X and the target."""
 
-EXTRA: Blocks = tuple(name for name in TABLE if name not in RIGID)
+FURTHER: Blocks = tuple(name for name in TABLE if name not in RIGID)
 """Further unknowns: what a caller may ask for beside X and the target."""
 
 TINY = 1e-20
@@ -162,8 +162,11 @@ def measured(lateral: Any, axial: Any, face: Any, values: Values) -> tuple[Any, 
     return lateral, distance
 
 
-def heard(distance: Any, values: Values) -> Any:
-    """What an element measures of a target at a distance (mm), mm at the nominal sound speed."""
+def predicted_distance(distance: Any, values: Values) -> Any:
+    """The distance that an element would measure of a target at ``distance``, mm.
+
+    The inverse of what :func:`measured` does to a range: a distance at the nominal sound speed.
+    """
     if "sound-speed" in values:
         distance = distance / values["sound-speed"][0]
     if "delay" in values:
@@ -194,7 +197,8 @@ def further_derivatives(
     """Derivatives of real functions by the steps of the free further unknowns, in numpy.
 
     They come from a complex step, which has practically no rounding error (Squire and Trapp, SIAM
-    Review 40, 1998). The function must be analytic, as :func:`measured` and :func:`heard` are.
+    Review 40, 1998). The function must be analytic, as :func:`measured` and
+    :func:`predicted_distance` are.
 
     Args:
         function: of the values; a sequence of arrays.
@@ -205,7 +209,7 @@ def further_derivatives(
         For each tangent its place among those of the blocks, and the derivatives.
     """
     found = []
-    for name in EXTRA:
+    for name in FURTHER:
         if name not in blocks:
             continue
         first, row = block_slice(blocks, name).start, TABLE[name]
@@ -244,7 +248,7 @@ def split_further(values: Any, blocks: Blocks) -> dict[str, list[Any]]:
     """Arrays (..., k) of all free further unknowns as components of each, by name."""
     first = size(RIGID)
     found = {}
-    for name in EXTRA:
+    for name in FURTHER:
         if name in blocks:
             at = block_slice(blocks, name)
             found[name] = [values[..., k - first] for k in range(at.start, at.stop)]

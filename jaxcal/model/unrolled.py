@@ -1,14 +1,14 @@
 """Small dense algebra written out scalar by scalar, for many problems side by side.
 
-A matrix is a list of rows of arrays that all have the same shape, one entry for every problem
-("lane"). Written out, a 9x9 Cholesky solve is one straight stretch of code that XLA turns into a
-few vectorised loops over the lanes. This form is the fastest to run and the slowest to compile.
+A matrix is a list of rows of arrays that all have the same shape, one entry for every problem.
+Written out, a 9x9 Cholesky solve is one straight stretch of code that XLA turns into a few
+vectorised loops over the problems. This form is the fastest to run and the slowest to compile.
 Structural zeros are the number 0 and cost nothing.
 
 The functions of single entries are called tens of thousands of times in one trace. Entries are of
 any type, so the tests, which check annotations at every call, need not check theirs.
 
-A matrix that is not positive definite gives NaN or Inf, in its own lane only.
+A matrix that is not positive definite gives NaN or Inf, for its own problem only.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 Entry = Any
-"""An array over the lanes, or the number 0."""
+"""An array over the problems, or the number 0."""
 
 Vector = list[Entry]
 Matrix = list[list[Entry]]
@@ -135,7 +135,7 @@ def rotation(vector: Vector) -> Matrix:
     """Cayley's rotation of a vector w (rad): Exp(w) to second order, and a rotation for any w.
 
     I + (2 / (1 + |h|^2)) ([h]x + [h]x^2), h = w / 2: the turn is by 2 atan(|w| / 2). It takes one
-    division; sine and cosine would be scalar calls for every lane and entry.
+    division; sine and cosine would be scalar calls for every problem and entry.
     """
     half = [0.5 * value for value in vector]
     factor = 2 / (1 + dot(half, half))

@@ -10,7 +10,7 @@ import numpy as np
 from jaxcal import InputError
 from jaxcal.calibration.dependence import independent
 from jaxcal.data.recording import Images, Recording
-from jaxcal.model.unknowns import EXTRA
+from jaxcal.model.unknowns import FURTHER
 from jaxcal.result.calibration import Calibration
 from jaxcal.solvers.closed_form.calibrate import calibrate_closed_form
 from jaxcal.solvers.closed_form.certificate import certify
@@ -26,7 +26,7 @@ def certificate_record(result: Calibration, recording: Recording) -> dict[str, A
     """
     nothing: dict[str, Any] = {"certified": None, "gap_mm2": None}
     images = recording.calibration
-    estimate = tuple(name for name in EXTRA if name in result.blocks)
+    estimate = tuple(name for name in FURTHER if name in result.blocks)
     own = result.method == "conventional"
     if images.kind == "time_of_flight" or not (estimate in ((), ("scale",)) or own):
         return nothing

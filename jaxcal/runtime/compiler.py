@@ -44,7 +44,7 @@ def known(platform: str, flags: Flags) -> Flags:
 
     Args:
         platform: ``cpu``, ``gpu`` or ``tpu``, as :func:`jax.default_backend` says it.
-        flags: wished for, by the names of XLA's debug options.
+        flags: by the names of XLA's debug options.
 
     Returns:
         The known ones. A flag that is not known is logged at level DEBUG and changes nothing.
@@ -53,7 +53,7 @@ def known(platform: str, flags: Flags) -> Flags:
     if _are_known(platform, items):
         return dict(flags)
     found = {name: value for name, value in items if _are_known(platform, ((name, value),))}
-    # Fast math without NaN and Inf makes a wrong answer of a bad lane: all three or none.
+    # Fast math without NaN and Inf gives a bad problem a wrong answer, not NaN: all three or none.
     if not FAST_MATH.keys() <= found.keys():
         found = {name: value for name, value in found.items() if FAST_MATH.get(name) != value}
     return found
@@ -74,8 +74,8 @@ def _are_known(platform: str, flags: tuple[tuple[str, Any], ...]) -> bool:
     return True
 
 
-def batch_wishes() -> Flags:
-    """Wishes for a program that solves batches on a CPU.
+def batch_flags() -> Flags:
+    """Flags for a program that solves batches on a CPU.
 
     Sums over images vectorise only if they may be reordered, which fast math allows. NaN and Inf
     keep their meaning. Reruns are bitwise equal, and answers are within 1e-12 mm of those with
@@ -87,9 +87,9 @@ def batch_wishes() -> Flags:
 
 
 def fast_to_run(platform: str) -> Flags | None:
-    """Those of :func:`batch_wishes` that the compiler knows, or None where it has none."""
-    wishes = batch_wishes()
-    return known(platform, wishes) if platform == "cpu" and wishes else None
+    """Those of :func:`batch_flags` that the compiler knows, or None where there are none."""
+    flags = batch_flags()
+    return known(platform, flags) if platform == "cpu" and flags else None
 
 
 def quick_to_compile(platform: str) -> Flags | None:
@@ -121,7 +121,7 @@ ONE_PROBLEM: Flags = {
     "xla_backend_optimization_level": 0,
     "xla_llvm_disable_expensive_passes": True,
 }
-"""Wishes for a program that solves one problem and that a person waits for.
+"""Flags for a program that solves one problem and that a person waits for.
 
 Measured on the joint method with 54 images (jax 0.10.2): 8.5 s of compilation instead of 17.7, 37
 ms of run time instead of 20.

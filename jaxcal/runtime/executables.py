@@ -1,4 +1,4 @@
-"""Programs of one problem, compiled once and kept: in this process and in the user's cache folder.
+"""Programs, compiled once and kept: in this process and in the user's cache folder.
 
 Most of the time to a first answer is tracing and compiling. Both are skipped if any process has
 compiled the program of the same plan and shapes before: :func:`run` then loads machine code and
@@ -7,8 +7,8 @@ does not call the function at all.
 A program is kept under a key that names everything it depends on: the function's name, the static
 plan, the shapes and dtypes of all arrays, the compiler's flags, and this installation
 (:func:`installation`): jaxlib's binary, the processor's features, the versions of what is traced
-through, and the sources of jaxcal. Who may write such files is the subject of
-:mod:`jaxcal.runtime.program_cache`. None of JAX's settings is changed.
+through, and the sources of jaxcal. :mod:`jaxcal.runtime.program_cache` says who may write the
+files. None of JAX's settings is changed.
 
 Trees of arrays are described as JSON (:func:`describe`), so that neither pickles nor a trace are
 needed to put a result together. Programs that call functions outside XLA (LAPACK, callbacks) are
@@ -86,7 +86,7 @@ Description = Any
 """The description of a tree, which JSON can hold."""
 
 Hold = Callable[[list[jax.Array]], list[Any]]
-"""Makes of a program's arrays, as soon as they are there, those that a caller wants."""
+"""From a program's result, once it is computed, to the arrays that the caller gets."""
 
 _log = logging.getLogger(__name__)
 
@@ -127,7 +127,7 @@ def bucket(count: int) -> int:
 
 
 def in_numpy(arrays: list[jax.Array]) -> list[np.ndarray]:
-    """A result that JAX need not compile anything for: it compiles every operation on its own."""
+    """A result as numpy arrays: each operation on JAX's would compile a program of its own."""
     return [np.asarray(array) for array in arrays]
 
 
@@ -152,7 +152,7 @@ def run(
             only where no program is kept.
         arguments: trees of concrete arrays: modules and dataclasses of jaxcal, tuples, None.
         plan: everything static about it.
-        flags: wished for; those unknown to the compiler are left out.
+        flags: of the compiler; those that it does not know are left out.
         label: what the program is, for ``jaxcal cache show``.
         hold: what to make of the result's arrays; by default numpy's.
 

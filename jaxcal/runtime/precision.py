@@ -7,7 +7,8 @@ values enters the modes that it needs and leaves them when it returns (:func:`in
 - 64 bits. Where the caller has them switched off, results come back as numpy arrays, which keep
   their 64 bits; JAX makes 32-bit arrays of them where the caller hands them on to JAX.
 - JAX's standard promotion of dtypes and ranks: strict promotion is meant for the caller's code.
-- no ``debug_nans``, ``debug_infs``: a lane without an answer holds NaN on purpose, and says so.
+- no ``debug_nans``, ``debug_infs``: a problem that has no answer holds NaN on purpose, and its
+  status says so.
 
 Inside a jit, vmap or grad of the caller, the caller decides the number of bits: arrays have lost
 theirs before any function sees them. A calibration there needs 64 bits (:func:`require_float64`),

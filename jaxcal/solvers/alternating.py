@@ -44,32 +44,32 @@ class Alternation(eqx.Module):
     """Where the alternation stopped.
 
     Attributes:
-        place: X and c.
+        iterate: X and c.
         cost: sum of squared distances, mm^2.
         cosine: gradient cosine of the bounded joint problem there.
         iterations: rounds.
-        settled: it stopped because X had stopped moving, not at the round limit.
+        converged: it stopped because X had stopped moving, not at the round limit.
         rotation_change: X's rotation in the last round, rad.
         translation_change: X's translation in the last round, mm.
         trace: cost after each of the first rounds, NaN beyond the last; None: not kept.
     """
 
-    place: Iterate
-    cost: Float[Array, " lanes"]
-    cosine: Float[Array, " lanes"]
-    iterations: Int[Array, " lanes"]
-    settled: Bool[Array, " lanes"]
-    rotation_change: Float[Array, " lanes"]
-    translation_change: Float[Array, " lanes"]
-    trace: Float[Array, "trace lanes"] | None
+    iterate: Iterate
+    cost: Float[Array, " batch"]
+    cosine: Float[Array, " batch"]
+    iterations: Int[Array, " batch"]
+    converged: Bool[Array, " batch"]
+    rotation_change: Float[Array, " batch"]
+    translation_change: Float[Array, " batch"]
+    trace: Float[Array, "trace batch"] | None
 
 
 class _Rounds(eqx.Module):
-    place: Iterate
-    rounds: Int[Array, " lanes"]
-    rotation_change: Float[Array, " lanes"]
-    translation_change: Float[Array, " lanes"]
-    trace: Float[Array, "trace lanes"] | None
+    iterate: Iterate
+    rounds: Int[Array, " batch"]
+    rotation_change: Float[Array, " batch"]
+    translation_change: Float[Array, " batch"]
+    trace: Float[Array, "trace batch"] | None
 
 
 def alternate(
@@ -99,28 +99,28 @@ def alternate(
     eps = jnp.finfo(none.dtype).eps
 
     def gauss_newton(_: Array, carry: tuple) -> tuple:
-        place, held = carry
-        normal = barrier(accumulate(place, held, images, None))
+        iterate, held = carry
+        normal = barrier(accumulate(iterate, held, images, None))
         eye = jnp.eye(len(normal.gradient), dtype=normal.gradient.dtype)[..., None]
         matrix, gradient = barrier((normal.stacked() * (1 + 16 * eps * eye), normal.gradient))
-        return barrier(place.moved(barrier(dense.solve_lanes_last(matrix, -gradient)))), held
+        return barrier(iterate.moved(barrier(dense.solve_batch_last(matrix, -gradient)))), held
 
     def one_round(state: _Rounds) -> _Rounds:
-        held = HeldOffsets.of(barrier(local_unknowns(state.place, observation, images)), images)
-        after, _ = jax.lax.fori_loop(0, inner_steps, gauss_newton, (state.place, held))
+        held = HeldOffsets.of(barrier(local_unknowns(state.iterate, observation, images)), images)
+        after, _ = jax.lax.fori_loop(0, inner_steps, gauss_newton, (state.iterate, held))
         kept = state.trace
         if kept is not None:
             kept = recorded(kept, state.rounds, accumulate(after, held, images, None).cost)
         moved = _Rounds(
             after,
             state.rounds + 1,
-            chord_angle(state.place.rotation - after.rotation),
-            jnp.sqrt(jnp.sum((state.place.translation - after.translation) ** 2, axis=0)),
+            chord_angle(state.iterate.rotation - after.rotation),
+            jnp.sqrt(jnp.sum((state.iterate.translation - after.translation) ** 2, axis=0)),
             kept,
         )
         return choose(active(state), moved, state)
 
-    def active(state: _Rounds) -> Bool[Array, " lanes"]:
+    def active(state: _Rounds) -> Bool[Array, " batch"]:
         moving = state.rotation_change >= tolerance_rad
         moving = moving | (state.translation_change >= tolerance_mm)
         return moving & (state.rounds < max_rounds)
@@ -133,14 +133,15 @@ def alternate(
         empty_trace(trace, none),
     )
     state = jax.lax.while_loop(lambda state: jnp.any(active(state)), one_round, state)
-    normal = barrier(accumulate(state.place, observation, images, None))
+    normal = barrier(accumulate(state.iterate, observation, images, None))
     rounding = Rounding.of(start, observation, images)
     return Alternation(
-        place=state.place,
+        iterate=state.iterate,
         cost=normal.cost,
         cosine=gradient_cosine(normal, rounding.vanished),
         iterations=state.rounds,
-        settled=(state.rotation_change < tolerance_rad) & (state.translation_change < tolerance_mm),
+        converged=(state.rotation_change < tolerance_rad)
+        & (state.translation_change < tolerance_mm),
         rotation_change=state.rotation_change,
         translation_change=state.translation_change,
         trace=state.trace,
@@ -177,7 +178,7 @@ def bounded(
         step[3] = by * turn
         return start.moved(step)
 
-    # All three starts at once, as three times as many lanes.
+    # All three starts at once, in a batch three times as large.
     starts = jax.tree.map(
         lambda *leaves: jnp.concatenate(leaves, axis=-1), *(turned(by) for by in TURNS)
     )
@@ -192,10 +193,10 @@ def bounded(
         max_rounds=WARM_UP_ROUNDS,
         inner_steps=2,
     )
-    fits = minimise(warm.place, everywhere, wide, max_steps=max_steps, trace=trace)
-    lanes = images.lanes
+    fits = minimise(warm.iterate, everywhere, wide, max_steps=max_steps, trace=trace)
+    count = images.batch_size
     parts = [
-        jax.tree.map(lambda leaf, k=k: leaf[..., k * lanes : (k + 1) * lanes], fits)
+        jax.tree.map(lambda leaf, k=k: leaf[..., k * count : (k + 1) * count], fits)
         for k in range(len(TURNS))
     ]
     costs = jnp.stack([jnp.where(jnp.isfinite(fit.cost), fit.cost, jnp.inf) for fit in parts])

@@ -49,10 +49,16 @@ from jaxcal.model.observations import MediumPrior, Observation, OwnCovariances, 
 from jaxcal.model.parameters import retract
 from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
 from jaxcal.solvers import dense
-from jaxcal.solvers.evidence import V_Y, NoiseModel, row_of, tune
-from jaxcal.solvers.expectation_propagation import SEEN, Sites, marginal, propagate, seen
-from jaxcal.solvers.normal_equations import stacked
-from jaxcal.solvers.offset_mean import MEAN_SD, believed, gained
+from jaxcal.solvers.evidence import NoiseModel, row_of, tune
+from jaxcal.solvers.expectation_propagation import (
+    SITE_UNKNOWNS,
+    Sites,
+    marginal,
+    propagate,
+    site_part,
+)
+from jaxcal.solvers.normal_equations import V_Y, stacked
+from jaxcal.solvers.offset_mean import MEAN_SD, log_evidence_gain, mean_belief
 
 LARGEST_CHANGE = 0.4
 """A law counts as long as the last sweep moved no unknown by more than about this many SDs.
@@ -65,10 +71,10 @@ MEDIAN_STEPS = 12
 
 
 class Averaged(eqx.Module):
-    """The estimate over all laws; lanes last, except in the law.
+    """The estimate over all laws; the batch axis is last, except in the law.
 
     Attributes:
-        place: the unknowns.
+        iterate: the unknowns.
         sigma: tuned SDs of the more probable noise model, mm.
         covariance: of the unknowns' tangent.
         elevation_sd: of every image's offset, mm; NaN for images left out.
@@ -76,37 +82,37 @@ class Averaged(eqx.Module):
         own_covariances: where the images' own covariances are the more probable ones.
     """
 
-    place: Iterate
-    sigma: Float[Array, "components lanes"]
-    covariance: Float[Array, "p p lanes"]
-    elevation_sd: Float[Array, "lanes n"]
+    iterate: Iterate
+    sigma: Float[Array, "components batch"]
+    covariance: Float[Array, "p p batch"]
+    elevation_sd: Float[Array, "batch n"]
     law: OffsetLaw
-    own_covariances: Bool[Array, " lanes"]
+    own_covariances: Bool[Array, " batch"]
 
 
 def average_over_laws(
-    place: Iterate,
+    iterate: Iterate,
     observation: Observation,
     images: ImagePlanes,
     shapes: tuple[Shape, ...],
     *,
-    variances: Float[Array, "3 lanes n"] | None,
-    bound: Float[Array, "lanes n"] | None,
+    variances: Float[Array, "3 batch n"] | None,
+    bound: Float[Array, "batch n"] | None,
     medium: MediumPrior | None,
 ) -> Averaged:
     """Weigh noise models, offset means and laws of the offsets, and average the answers.
 
     Args:
-        place: the self-tuned Gaussian solutions.
+        iterate: the self-tuned Gaussian solutions.
         observation: with common SDs, tuned.
         images: the data.
         shapes: the laws to weigh.
         variances: the images' own: lateral variance, covariance, range variance, mm^2; or None.
         bound: on the offsets, mm, which cuts the laws; or None.
-        medium: what is known of sound speed and delay beforehand.
+        medium: prior of sound speed and delay, or None.
     """
-    used, unknowns = images.used, place.unknowns
-    common = tune(place, observation, images, medium)
+    used, unknowns = images.used, iterate.unknowns
+    common = tune(iterate, observation, images, medium)
     model = Linearised.of(common, common.sigma)
     sites = sites_at(model, images, bound)
     answers = answers_under(model, sites, shapes)
@@ -115,9 +121,12 @@ def average_over_laws(
         other, more_probable = with_own_covariances(common, observation, images, variances, medium)
         own = jax.nn.sigmoid(more_probable)
         beside = answers_under(other, sites_at(other, images, bound), shapes)
+        step = model.iterate.step_to(other.iterate)
         answers = Answers.joined(
             answers.shared(1 - own),
-            beside.seen_from(model.place.step_to(other.place), other.mean - model.mean).shared(own),
+            beside.seen_from(model.iterate.step_to(other.iterate), other.mean - model.mean).shared(
+                own
+            ),
         )
         sigma = choose(own > 0.5, other.sigma, model.sigma)
     else:
@@ -125,14 +134,14 @@ def average_over_laws(
     step, covariance = median(answers, model.offsets_metric())
     step, covariance = barrier((step, covariance))
 
-    at = np.array(SEEN)
+    at = np.array(SITE_UNKNOWNS)
     variance = sites.variance(covariance[at[:, None], at])
 
     enough = (used >= MINIMUM_SELF_TUNING) & answers.settled & jnp.all(jnp.isfinite(step), axis=0)
     # The answer may be a hundredth of a radian from the linearisation: turn by Exp, since the
     # solvers' rotation (Cayley's) then differs from it in the eighth digit.
-    moved = jax.vmap(lambda here, by: retract(here, by, place.blocks))(
-        model.place.parameters(), step[:unknowns].T
+    moved = jax.vmap(lambda here, by: retract(here, by, iterate.blocks))(
+        model.iterate.parameters(), step[:unknowns].T
     )
     member = jnp.asarray([[shape.family == name for shape in shapes] for name in FAMILIES])
     weight = answers.weight.reshape(-1, len(shapes), len(used)).sum(axis=0)
@@ -149,11 +158,11 @@ def average_over_laws(
         own_probability=where_weighed(own),
         weighed=enough,
     )
-    place, sigma = choose(
-        enough, (Iterate.of(moved, place.blocks), sigma), (place, observation.sigma)
+    iterate, sigma = choose(
+        enough, (Iterate.of(moved, iterate.blocks), sigma), (iterate, observation.sigma)
     )
     return Averaged(
-        place,
+        iterate,
         sigma,
         covariance[:unknowns, :unknowns],
         jnp.sqrt(jnp.where(images.mask > 0, variance, jnp.nan)),
@@ -163,10 +172,10 @@ def average_over_laws(
 
 
 class Linearised(eqx.Module):
-    """A noise model, linearised where it was tuned; lanes last.
+    """A noise model, linearised where it was tuned; batch axis last.
 
     Attributes:
-        place: X, c and the further unknowns.
+        iterate: X, c and the further unknowns.
         mean: b, mm.
         trust: share of the data's information about b that is used.
         sigma: SDs of the components of the common noise model, mm.
@@ -176,14 +185,14 @@ class Linearised(eqx.Module):
         pull: sum of h_i (q_iy - b).
     """
 
-    place: Iterate
-    mean: Float[Array, " lanes"]
-    trust: Float[Array, " lanes"]
-    sigma: Float[Array, "components lanes"]
-    information: Float[Array, "triangle lanes"]
-    gradient: Float[Array, "p lanes"]
-    squares: Float[Array, "triangle lanes"]
-    pull: Float[Array, "p lanes"]
+    iterate: Iterate
+    mean: Float[Array, " batch"]
+    trust: Float[Array, " batch"]
+    sigma: Float[Array, "components batch"]
+    information: Float[Array, "triangle batch"]
+    gradient: Float[Array, "p batch"]
+    squares: Float[Array, "triangle batch"]
+    pull: Float[Array, "p batch"]
 
     @classmethod
     def of(cls, tuned: NoiseModel, sigma: Array) -> Linearised:
@@ -191,11 +200,11 @@ class Linearised(eqx.Module):
         sums = tuned.sums
         # The offsets get no weight here; their law follows later.
         weight = jnp.concatenate([1 / tuned.sigma[:-1] ** 2, jnp.zeros_like(tuned.sigma[:1])])
-        measured = sums.weighed(weight)
+        measured = sums.weighted(weight)
         # h_i is -1 at v_y, so v_y's row of the sum of h_i h_i' is minus the sum of h_i.
         along = row_of(sums.matrix[-1], V_Y)
         return cls(
-            tuned.place,
+            tuned.iterate,
             tuned.mean,
             tuned.trust,
             sigma,
@@ -205,7 +214,7 @@ class Linearised(eqx.Module):
             sums.gradient[-1] + tuned.mean * along,
         )
 
-    def offsets_metric(self) -> Float[Array, "q q lanes"]:
+    def offsets_metric(self) -> Float[Array, "q q batch"]:
         """Sum of h_i h_i' with b as the last unknown; b moves the offsets as v_y does."""
         matrix = stacked(self.squares)
         matrix = jnp.concatenate([matrix, matrix[V_Y][None]])
@@ -213,7 +222,7 @@ class Linearised(eqx.Module):
 
 
 class Answers(eqx.Module):
-    """The belief about the unknowns and b under every law, relative to one place; lanes last.
+    """The belief about the unknowns and b under every law, relative to an iterate; batch axis last.
 
     Attributes:
         mean: of all unknowns and b.
@@ -224,18 +233,18 @@ class Answers(eqx.Module):
             cut it always does.
     """
 
-    mean: Float[Array, "q k lanes"]
-    covariance: Float[Array, "q q k lanes"]
-    weight: Float[Array, "k lanes"]
-    mean_probability: Float[Array, "k lanes"]
-    settled: Bool[Array, " lanes"]
+    mean: Float[Array, "q k batch"]
+    covariance: Float[Array, "q q k batch"]
+    weight: Float[Array, "k batch"]
+    mean_probability: Float[Array, "k batch"]
+    settled: Bool[Array, " batch"]
 
-    def shared(self, share: Float[Array, " lanes"]) -> Answers:
+    def shared(self, share: Float[Array, " batch"]) -> Answers:
         """The answers with a share of their weight."""
         return eqx.tree_at(lambda each: each.weight, self, share * self.weight)
 
-    def seen_from(self, step: Float[Array, "p lanes"], mean: Float[Array, " lanes"]) -> Answers:
-        """The answers relative to another place; ``step`` leads from that one to this one."""
+    def seen_from(self, step: Float[Array, "p batch"], mean: Float[Array, " batch"]) -> Answers:
+        """The answers relative to another iterate; ``step`` leads from that one to this one."""
         step = jnp.concatenate([step, mean[None]])
         return eqx.tree_at(lambda each: each.mean, self, self.mean + step[:, None])
 
@@ -256,11 +265,11 @@ class Answers(eqx.Module):
 
 
 def sites_at(
-    model: Linearised, images: ImagePlanes, bound: Float[Array, "lanes n"] | None
+    model: Linearised, images: ImagePlanes, bound: Float[Array, "batch n"] | None
 ) -> Sites:
     """The offsets of a linearised problem, as the laws see them."""
-    q, turned = targets(model.place, images)
-    return barrier(Sites.of(q, turned, images.mask, model.mean, bound))
+    q, tracker_to_image = targets(model.iterate, images)
+    return barrier(Sites.of(q, tracker_to_image, images.mask, model.mean, bound))
 
 
 def answers_under(model: Linearised, sites: Sites, shapes: tuple[Shape, ...]) -> Answers:
@@ -270,13 +279,13 @@ def answers_under(model: Linearised, sites: Sites, shapes: tuple[Shape, ...]) ->
     stretch = jnp.asarray([shape.stretch for shape in shapes], sd.dtype)
     prior = jnp.asarray([shape.prior for shape in shapes], sd.dtype)
     families: list[Family] = [shape.family for shape in shapes]
-    squares, pull = barrier(seen(model.squares, model.pull))
+    squares, pull = barrier(site_part(model.squares, model.pull))
     found = propagate(known, sites, squares, pull, families, stretch[:, None] * sd)
 
     mean, covariance = barrier(known.lift()(found.mean, found.covariance))
     variance = covariance[-1, -1]
-    belief = believed(model.mean + mean[-1], variance, sd, model.trust)
-    weight, good = weights(found.log_evidence + gained(belief), found.change, prior)
+    belief = mean_belief(model.mean + mean[-1], variance, sd, model.trust)
+    weight, good = weights(found.log_evidence + log_evidence_gain(belief), found.change, prior)
     # The other unknowns follow b.
     along = covariance[:, -1] / variance
     # Values of a law are computed once, and not again for every entry of its covariance.
@@ -297,9 +306,9 @@ def with_own_covariances(
     common: NoiseModel,
     observation: Points,
     images: ImagePlanes,
-    variances: Float[Array, "3 lanes n"],
+    variances: Float[Array, "3 batch n"],
     medium: MediumPrior | None,
-) -> tuple[Linearised, Float[Array, " lanes"]]:
+) -> tuple[Linearised, Float[Array, " batch"]]:
     """The noise model of the images' own covariances, and ln of how much more probable it is."""
     used, sigma = images.used, common.sigma
     shape, mean = unit_shape(variances, images)
@@ -310,7 +319,7 @@ def with_own_covariances(
     )
     scale = jnp.sqrt(0.5 * jnp.sum((sigma[:2] / ratio) ** 2, axis=0))
     tied = OwnCovariances(jnp.stack([scale, sigma[2]]), shape, jnp.ones_like(scale), tied=True)
-    tuned = tune(common.place, tied, images, medium)
+    tuned = tune(common.iterate, tied, images, medium)
     determinant = shape[0] * shape[2] - shape[1] ** 2
     # The common model tunes one SD more; that costs half the log of the number of images.
     penalty = 0.5 * jnp.sum(images.mask * jnp.log(determinant), axis=1) - 0.5 * jnp.log(used)
@@ -321,8 +330,8 @@ def with_own_covariances(
 
 
 def median(
-    answers: Answers, metric: Float[Array, "q q lanes"]
-) -> tuple[Float[Array, "q lanes"], Float[Array, "q q lanes"]]:
+    answers: Answers, metric: Float[Array, "q q batch"]
+) -> tuple[Float[Array, "q batch"], Float[Array, "q q batch"]]:
     """The answers' geometric median, and the covariance about it.
 
     Mean RP is the average of a distance, not of its square, so the answer is where the expected
@@ -343,7 +352,7 @@ def median(
     means = answers.mean - centre[:, None]
     # Of the answers, only their scalar products matter.
     forward = jnp.swapaxes(means, 0, 1)[:, :, None]
-    products = jnp.sum(forward * dense.product_lanes_last(metric, means), axis=1)
+    products = jnp.sum(forward * dense.product_batch_last(metric, means), axis=1)
     within, means, products = barrier((within, means, products))
     tiny = jnp.finfo(weight.dtype).tiny
 
@@ -355,10 +364,9 @@ def median(
         return pull / jnp.where(whole > 0, whole, 1.0)
 
     share = barrier(jax.lax.fori_loop(0, MEDIAN_STEPS, once, weight))
-    place = jnp.sum(share * means, axis=1)
-    off = means - place[:, None]
-    place = centre + place
-    return place, jnp.sum(weight * (answers.covariance + off[:, None] * off), axis=2)
+    found = jnp.sum(share * means, axis=1)
+    off = means - found[:, None]
+    return centre + found, jnp.sum(weight * (answers.covariance + off[:, None] * off), axis=2)
 
 
 def weights(
@@ -375,6 +383,6 @@ def weights(
     moving = (jnp.where(good, change, 0.0) / LARGEST_CHANGE) ** 4
     score = jnp.where(good, log_evidence, 0.0) + jnp.log(prior) - moving
     score = jnp.where(good, score, -jnp.inf)
-    # Where no law is good the weights must still be numbers: a lane's NaN poisons its gradient.
+    # Where no law is good the weights must still be numbers: a problem's NaN poisons its gradient.
     score = jnp.where(jnp.any(good, axis=0), score, 0.0)
     return jax.nn.softmax(score, axis=0) * good, good

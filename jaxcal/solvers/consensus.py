@@ -16,8 +16,8 @@ residuals do not tell good images from bad ones, so the good ones are found by c
    image in use has Gaussian errors with the SDs of the images in use. An image is wrong with
    probability ``WRONG``; each of its errors is then as predicted or anywhere in a range of
    ``ANYTHING_MM``. Medians alone would not do: six of a dozen images can be fitted with almost no
-   error in one component, which looks like agreement. And where no image is gravely wrong none is
-   left out, so that the robust answer is exactly the plain one.
+   error in one component, which looks like agreement. If no image is an outlier, none is left out,
+   and the result equals that of ``robust=False``.
 
 The errors are those of the joint method (lateral position, range, elevational offset), each
 with its own SD. An image stands out where a component, corrected for the image's leverage, is more
@@ -136,7 +136,7 @@ def find_consensus(problem: Problem, model: ConsensusModel) -> Consensus:
 
     count = finalists(used.shape[0])
     _, best = jax.lax.top_k(-jax.vmap(score)(proposed)[1:], count)
-    # The first lane assumes that all images are good; it competes with those that leave some out.
+    # The first candidate takes all images as good; it competes with those that leave some out.
     chosen = jnp.concatenate([jnp.zeros(1, best.dtype), best + 1])
     everything = jnp.arange(count + 1) == 0
     finished: Consensus

@@ -1,11 +1,11 @@
 """Small dense linear algebra in plain array operations, for matrices of a dozen rows in a batch.
 
-XLA hands ``jnp.linalg`` to LAPACK on the CPU, one small call a lane. Up to jaxlib 0.11.0 it spreads
-the lanes of a batch over its thread pool while a thread of that same pool waits for them. Two such
-calls that do not depend on each other can then wait for each other for ever, which stopped whole
-studies on two cores (docs/developers/upstream/xla-cpu-lapack-deadlock.md). These loops of array
-operations cannot deadlock; they also vectorise over the batch and run unchanged on a GPU, which has
-no LAPACK.
+XLA hands ``jnp.linalg`` to LAPACK on the CPU, one small call a matrix. Up to jaxlib 0.11.0 it
+spreads these calls over its thread pool while a thread of that same pool waits for them. Two
+batches of calls that do not depend on each other can then wait for each other for ever, which
+stopped whole studies on two cores (docs/developers/upstream/xla-cpu-lapack-deadlock.md). The loops
+of array operations here cannot deadlock; they also vectorise over the batch and run unchanged on a
+GPU, which has no LAPACK.
 
 Reference: Golub and Van Loan, Matrix Computations, 4th ed., 3.4.
 """
@@ -111,15 +111,15 @@ def inverse(matrix: Float[Array, "p p"]) -> Float[Array, "p p"]:
 
 
 def _column(matrix: Float[Array, "m q"], k: Array) -> Float[Array, " m"]:
-    # A masked sum: a gather of one column a lane is many times slower.
+    # A masked sum: a gather of one column of every matrix is many times slower.
     return jnp.sum(jnp.where(jnp.arange(matrix.shape[1]) == k, matrix, 0.0), axis=1)
 
 
 @jax.jit
-def inverse_lanes_last(
-    matrix: Float[Array, "p p lanes"],
-) -> tuple[Float[Array, "p p lanes"], Float[Array, " lanes"]]:
-    """Inverses and log determinants of symmetric positive definite matrices, lanes last.
+def inverse_batch_last(
+    matrix: Float[Array, "p p batch"],
+) -> tuple[Float[Array, "p p batch"], Float[Array, " batch"]]:
+    """Inverses and log determinants of symmetric positive definite matrices; batch axis last.
 
     With the leading block A = L L', W = L^-1 and the rows B beside it, one sweep makes
 
@@ -161,20 +161,20 @@ def inverse_lanes_last(
     return -work[:size, :size], log_determinant
 
 
-def solve_lanes_last(
-    matrix: Float[Array, "p p lanes"], vector: Float[Array, "p lanes"]
-) -> Float[Array, "p lanes"]:
-    """Solve positive definite systems, lanes last; where one is not, its own lane is not finite.
+def solve_batch_last(
+    matrix: Float[Array, "p p batch"], vector: Float[Array, "p batch"]
+) -> Float[Array, "p batch"]:
+    """Solve positive definite systems; batch axis last. NaN or Inf where one is not.
 
     Cholesky written out scalar by scalar (:mod:`jaxcal.model.unrolled`) is faster to run, but much
     slower to compile.
     """
-    inverse, _ = inverse_lanes_last(matrix)
-    return product_lanes_last(inverse, vector)
+    inverse, _ = inverse_batch_last(matrix)
+    return product_batch_last(inverse, vector)
 
 
 @jax.jit
-def _inverse_of_cholesky(matrix: Float[Array, "b b lanes"]) -> Float[Array, "b b lanes"]:
+def _inverse_of_cholesky(matrix: Float[Array, "b b batch"]) -> Float[Array, "b b batch"]:
     """L^-1 of A = L L', for a few rows."""
     size = matrix.shape[0]
     factor, pivots = unrolled.cholesky([[matrix[i, j] for j in range(size)] for i in range(size)])
@@ -187,10 +187,10 @@ def _inverse_of_cholesky(matrix: Float[Array, "b b lanes"]) -> Float[Array, "b b
     return jnp.stack(columns, axis=1)
 
 
-def product_lanes_last(
-    first: Float[Array, "p q *lanes"], second: Float[Array, "q *#r"]
+def product_batch_last(
+    first: Float[Array, "p q *batch"], second: Float[Array, "q *#r"]
 ) -> Float[Array, "p *#r"]:
-    """Products of many matrices (or of matrices and vectors), lanes last."""
+    """Products of many matrices (or of matrices and vectors); batch axis last."""
     if first.ndim > second.ndim:
         return jnp.sum(first * second, axis=1)
     if len(second) > BLOCK:
@@ -199,8 +199,8 @@ def product_lanes_last(
 
 
 def _outer_products(
-    first: Float[Array, "p q *#lanes"], second: Float[Array, "q r *#lanes"]
-) -> Float[Array, "p r *#lanes"]:
+    first: Float[Array, "p q *#batch"], second: Float[Array, "q r *#batch"]
+) -> Float[Array, "p r *#batch"]:
     """The product of matrices as a sum of outer products.
 
     XLA's reduction over an axis between others is much slower for large ones; it compiles sooner.

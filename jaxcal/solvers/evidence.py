@@ -34,13 +34,14 @@ from jaxcal.model.observations import MediumPrior, Observation
 from jaxcal.runtime.compiler import traced_once
 from jaxcal.solvers import dense
 from jaxcal.solvers.normal_equations import (
+    V_Y,
     ComponentSums,
     component_sums,
     pairs,
     square_places,
     stacked,
 )
-from jaxcal.solvers.offset_mean import MEAN_SD, believed, gained, influences, trust_in
+from jaxcal.solvers.offset_mean import MEAN_SD, influences, log_evidence_gain, mean_belief, trust_in
 from jaxcal.solvers.reml import helmert, least_sigma
 
 ROUNDS = 2
@@ -49,28 +50,25 @@ ROUNDS = 2
 UPDATES = 2
 """Updates of the SDs in each linearisation."""
 
-V_Y = 1
-"""Index of v_y, the unknown that moves every q_iy by -1."""
-
 
 class NoiseModel(eqx.Module):
-    """A Gaussian noise model tuned to the data; lanes last.
+    """A Gaussian noise model tuned to the data; batch axis last.
 
     Attributes:
-        place: X, c and the further unknowns.
+        iterate: X, c and the further unknowns.
         mean: b, mm.
         sigma: SD of each component, mm.
-        sums: of the images at ``place``.
+        sums: of the images at ``iterate``.
         trust: share of the data's information about b that is used.
     """
 
-    place: Iterate
-    mean: Float[Array, " lanes"]
-    sigma: Float[Array, "k lanes"]
+    iterate: Iterate
+    mean: Float[Array, " batch"]
+    sigma: Float[Array, "k batch"]
     sums: ComponentSums
-    trust: Float[Array, " lanes"]
+    trust: Float[Array, " batch"]
 
-    def log_evidence(self, count: Float[Array, "k lanes"]) -> Float[Array, " lanes"]:
+    def log_evidence(self, count: Float[Array, "k batch"]) -> Float[Array, " batch"]:
         """Ln Z, up to a constant and the covariances' determinants.
 
         Args:
@@ -78,8 +76,10 @@ class NoiseModel(eqx.Module):
         """
         system = System.of(self.sums, self.mean)
         inverse, step, evidence = system.solved(self.sigma, self.mean)
-        with_mean = believed(self.mean + step[-1], inverse[-1, -1], self.sigma[-1], self.trust)
-        return evidence + gained(with_mean) - jnp.sum(count * jnp.log(self.sigma), axis=0)
+        with_mean = mean_belief(self.mean + step[-1], inverse[-1, -1], self.sigma[-1], self.trust)
+        return (
+            evidence + log_evidence_gain(with_mean) - jnp.sum(count * jnp.log(self.sigma), axis=0)
+        )
 
 
 class System(eqx.Module):
@@ -93,9 +93,9 @@ class System(eqx.Module):
     """
 
     sums: ComponentSums
-    border: Float[Array, "q lanes"]
-    gradient: Float[Array, "k q lanes"]
-    squares: Float[Array, "k lanes"]
+    border: Float[Array, "q batch"]
+    gradient: Float[Array, "k q batch"]
+    squares: Float[Array, "k batch"]
 
     @classmethod
     def of(cls, sums: ComponentSums, mean: Array) -> System:
@@ -112,27 +112,27 @@ class System(eqx.Module):
     def solved(self, sigma: Array, mean: Array) -> tuple[Array, Array, Array]:
         """Inverse and step with given SDs if there is a mean, and ln Z without the SDs' terms."""
         weight, precision = 1 / sigma**2, (MEAN_SD * sigma[-1]) ** -2.0
-        normal = self.sums.weighed(weight)
+        normal = self.sums.weighted(weight)
         unknowns = normal.gradient.shape[0]
         last = (np.arange(unknowns + 1) == unknowns)[:, None]
         border = weight[-1] * self.border + jnp.where(last, precision, 0.0)
         gradient = jnp.sum(weight[:, None] * self.gradient, axis=0)
         gradient = gradient + jnp.where(last, precision * mean, 0.0)
         cost = jnp.sum(weight * self.squares, axis=0) + precision * mean**2
-        if self.sums.known is not None:
-            away, slope, _ = self.sums.known
+        if self.sums.prior is not None:
+            away, slope, _ = self.sums.prior
             gradient = gradient + jnp.concatenate([slope, jnp.zeros_like(slope[:1])])
             cost = cost + away
         flat, border, gradient = barrier((normal.curvature, border, gradient))
         whole = jnp.concatenate([stacked(flat), border[:-1, None]], axis=1)
         whole = jnp.concatenate([whole, border[None]])
-        inverse, log_determinant = dense.inverse_lanes_last(whole)
-        step = -dense.product_lanes_last(inverse, gradient)
+        inverse, log_determinant = dense.inverse_batch_last(whole)
+        step = -dense.product_batch_last(inverse, gradient)
         # The cost at the minimum, which is a small step away.
         cost = cost + jnp.sum(gradient * step, axis=0)
         return inverse, step, 0.5 * (jnp.log(precision) - cost - log_determinant)
 
-    def traces(self, matrix: Float[Array, "q q lanes"]) -> Float[Array, "k lanes"]:
+    def traces(self, matrix: Float[Array, "q q batch"]) -> Float[Array, "k batch"]:
         """tr(A N_k) of every component, A symmetric."""
         last = matrix.shape[0] - 1
         rows, columns = (np.array(each) for each in zip(*pairs(last), strict=True))
@@ -144,13 +144,13 @@ class System(eqx.Module):
         return found + np.eye(len(found), dtype=matrix.dtype)[-1][:, None] * own
 
 
-def row_of(flat: Float[Array, "triangle lanes"], k: int) -> Float[Array, "p lanes"]:
+def row_of(flat: Float[Array, "triangle batch"], k: int) -> Float[Array, "p batch"]:
     """A row of a symmetric matrix from its upper triangle."""
     return picked(flat, square_places(int((2 * flat.shape[0]) ** 0.5))[k])
 
 
 def tune(
-    place: Iterate,
+    iterate: Iterate,
     observation: Observation,
     images: ImagePlanes,
     medium: MediumPrior | None,
@@ -159,10 +159,10 @@ def tune(
     """Tune the SDs, the unknowns and the mean from a nearby solution.
 
     Args:
-        place: to start from.
+        iterate: to start from.
         observation: with the SDs to start from, mm.
         images: the data.
-        medium: what is known of sound speed and delay beforehand.
+        medium: prior of sound speed and delay, or None.
         rounds: passes before the last one.
     """
     count, start = observation.count(images), observation.sigma
@@ -177,14 +177,14 @@ def tune(
         order = jnp.argsort(~used, axis=1)
         return tuple(jnp.take_along_axis(plane, order, axis=1) for plane in planes)
 
-    def sums_at(place: Iterate) -> ComponentSums:
-        return barrier(component_sums(place, observation, images, None, medium))
+    def sums_at(iterate: Iterate) -> ComponentSums:
+        return barrier(component_sums(iterate, observation, images, None, medium))
 
-    def improved(sums: ComponentSums, place: Iterate, mean: Array, sigma: Array) -> tuple:
+    def improved(sums: ComponentSums, iterate: Iterate, mean: Array, sigma: Array) -> tuple:
         system = System.of(sums, mean)
         inverse, step, _ = barrier(system.solved(sigma, mean))
         moved, share = influences(
-            place, observation, images, 1 / sigma**2, mean, along=inverse[:, -1], step=step
+            iterate, observation, images, 1 / sigma**2, mean, along=inverse[:, -1], step=step
         )
         # Sorting takes a tenth of a calibration's time, and most recordings have no gaps.
         moved, share = jax.lax.cond(gaps, without_gaps, lambda planes: planes, (moved, share))
@@ -194,7 +194,7 @@ def tune(
             sigma, _ = state
             inverse, step, _ = barrier(system.solved(sigma, mean))
             variance = inverse[-1, -1]
-            belief = believed(mean + step[-1], variance, sigma[-1], trust)
+            belief = mean_belief(mean + step[-1], variance, sigma[-1], trust)
             # The other unknowns follow b.
             along = inverse[:, -1] / variance
             step = step + along * (belief.mean - mean - step[-1])
@@ -205,24 +205,24 @@ def tune(
             updated = helmert(left, system.traces(inverse), count, sigma)
             return jnp.maximum(updated, floor), step
 
-        none = jnp.zeros((place.unknowns + 1, mean.shape[0]), mean.dtype)
+        none = jnp.zeros((iterate.unknowns + 1, mean.shape[0]), mean.dtype)
         sigma, step = jax.lax.fori_loop(0, UPDATES, update, (sigma, none))
-        return barrier((place.moved(step[:-1]), mean + step[-1], sigma, trust))
+        return barrier((iterate.moved(step[:-1]), mean + step[-1], sigma, trust))
 
-    sums_at, none = traced_once(sums_at, place)
+    sums_at, none = traced_once(sums_at, iterate)
 
     # The code of the sums appears once, for the rounds and the result: it is half of the program.
     def one_round(index: Array, state: tuple) -> tuple:
-        place, mean, sigma, trust, _ = state
-        sums = sums_at(place)
-        place, mean, sigma, trust = jax.lax.cond(
+        iterate, mean, sigma, trust, _ = state
+        sums = sums_at(iterate)
+        iterate, mean, sigma, trust = jax.lax.cond(
             index < rounds,
-            lambda: improved(sums, place, mean, sigma),
-            lambda: (place, mean, sigma, trust),
+            lambda: improved(sums, iterate, mean, sigma),
+            lambda: (iterate, mean, sigma, trust),
         )
-        return place, mean, sigma, trust, sums
+        return iterate, mean, sigma, trust, sums
 
     zero = jnp.zeros_like(start[0])
-    state = (place, zero, start, zero + 1, none)
-    place, mean, sigma, trust, sums = jax.lax.fori_loop(0, rounds + 1, one_round, state)
-    return NoiseModel(place, mean, sigma, sums, trust)
+    state = (iterate, zero, start, zero + 1, none)
+    iterate, mean, sigma, trust, sums = jax.lax.fori_loop(0, rounds + 1, one_round, state)
+    return NoiseModel(iterate, mean, sigma, sums, trust)

@@ -50,7 +50,7 @@ from jaxcal.model.shapes import Family, Moments, tilted
 from jaxcal.model.unrolled import Matrix, Vector
 from jaxcal.runtime.compiler import traced_once
 from jaxcal.solvers import dense
-from jaxcal.solvers.normal_equations import pairs, square_places, stacked
+from jaxcal.solvers.normal_equations import V_Y, pairs, square_places, stacked
 
 SWEEPS = 3
 """Sweeps under each law, from the sites of the law before; a family's first gets twice as many."""
@@ -60,21 +60,19 @@ DAMPING = 0.8
 LEAST_ROOM = 1e-3
 """Least 1 - tau_i v_i: at zero, the belief without site i is no Gaussian any more."""
 
-SEEN = (1, 3, 5, 6, 7, 8)
+SITE_UNKNOWNS = (V_Y, 3, 5, 6, 7, 8)
 """v_y (as s), w_x, w_z and d: the unknowns on which the sites depend."""
 
-ELEVATION = SEEN[0]
-
-TRIANGLE = pairs(len(SEEN))
+TRIANGLE = pairs(len(SITE_UNKNOWNS))
 
 
-def hidden(unknowns: int) -> list[int]:
+def eliminated(unknowns: int) -> list[int]:
     """The unknowns that z leaves out: v_x, v_z, w_y, the further unknowns and, last of all, b."""
     return [0, 2, 4, *range(RIGID_UNKNOWNS, unknowns + 1)]
 
 
 class Sites(eqx.Module):
-    """The offsets as the sites see them, one plane (lanes, n) for every number.
+    """The offsets as the sites see them, one plane (batch, n) for every number.
 
     Attributes:
         direction: h_i, in the order of z.
@@ -85,28 +83,28 @@ class Sites(eqx.Module):
     """
 
     direction: Vector
-    offset: Float[Array, "lanes n"]
-    used: Float[Array, "lanes n"]
-    lower: Float[Array, "lanes n"] | None
-    upper: Float[Array, "lanes n"] | None
+    offset: Float[Array, "batch n"]
+    used: Float[Array, "batch n"]
+    lower: Float[Array, "batch n"] | None
+    upper: Float[Array, "batch n"] | None
 
     @classmethod
     def of(
         cls,
         q: Vector,
-        turned: Matrix,
-        used: Float[Array, "lanes n"],
-        mean: Float[Array, " lanes"],
-        bound: Float[Array, "lanes n"] | None,
+        tracker_to_image: Matrix,
+        used: Float[Array, "batch n"],
+        mean: Float[Array, " batch"],
+        bound: Float[Array, "batch n"] | None,
     ) -> Sites:
         """From q_i and M_i, about a mean b of the offsets, within bounds on |q_iy|."""
         about = mean[:, None]
         lower, upper = (None, None) if bound is None else (-bound - about, bound - about)
-        direction = [jnp.full_like(q[1], -1.0), q[2], -q[0], *turned[1]]
+        direction = [jnp.full_like(q[1], -1.0), q[2], -q[0], *tracker_to_image[1]]
         return cls(direction, q[1] - about, used, lower, upper)
 
     @jax.jit
-    def variance(self, covariance: Float[Array, "6 6 lanes"]) -> Float[Array, "lanes n"]:
+    def variance(self, covariance: Float[Array, "6 6 batch"]) -> Float[Array, "batch n"]:
         """h_i' C h_i, mm^2: the variance of every image's offset."""
         h, entry, size = self.direction, covariance[..., None], len(self.direction)
         # Of the entries off the diagonal both are counted at once.
@@ -120,42 +118,42 @@ class Sites(eqx.Module):
 
 
 class Marginal(eqx.Module):
-    """What the measurements say of z, and how the other unknowns follow from it; lanes last.
+    """What the measurements say of z, and how the other unknowns follow from it; batch axis last.
 
     Attributes:
         information: of z.
         gradient: of the log likelihood at z = 0.
-        shift: the others (:func:`hidden`) at z = 0.
+        shift: the others (:func:`eliminated`) at z = 0.
         slope: rows B of others = shift + B z.
         spread: their covariance for given z.
     """
 
-    information: Float[Array, "6 6 lanes"]
-    gradient: Float[Array, "6 lanes"]
-    shift: Float[Array, "h lanes"]
-    slope: Float[Array, "h 6 lanes"]
-    spread: Float[Array, "h h lanes"]
+    information: Float[Array, "6 6 batch"]
+    gradient: Float[Array, "6 batch"]
+    shift: Float[Array, "h batch"]
+    slope: Float[Array, "h 6 batch"]
+    spread: Float[Array, "h h batch"]
 
     def lift(self) -> Lift:
         """How all unknowns, b last, follow from z."""
-        eye = jnp.eye(len(SEEN), dtype=self.gradient.dtype)[..., None]
-        seen = jnp.broadcast_to(eye, (len(SEEN), *self.gradient.shape))
+        eye = jnp.eye(len(SITE_UNKNOWNS), dtype=self.gradient.dtype)[..., None]
+        seen = jnp.broadcast_to(eye, (len(SITE_UNKNOWNS), *self.gradient.shape))
         shift = jnp.concatenate([self.shift, jnp.zeros_like(self.gradient)])
         slope = jnp.concatenate([self.slope, seen])
-        spread = jnp.pad(self.spread, [(0, len(SEEN)), (0, len(SEEN)), (0, 0)])
-        order = [*hidden(len(shift) - 1), *SEEN]
+        spread = jnp.pad(self.spread, [(0, len(SITE_UNKNOWNS)), (0, len(SITE_UNKNOWNS)), (0, 0)])
+        order = [*eliminated(len(shift) - 1), *SITE_UNKNOWNS]
         back = np.argsort(order)
         whole = jnp.concatenate([shift[:, None], slope, spread], axis=1)[back]
         # From s back to v_y = s - b.
-        whole = whole - (np.arange(len(back)) == ELEVATION)[:, None, None] * whole[-1]
-        spread = whole[:, 1 + len(SEEN) :][:, back]
-        sheared = (np.arange(len(back)) == ELEVATION)[None, :, None]
+        whole = whole - (np.arange(len(back)) == V_Y)[:, None, None] * whole[-1]
+        spread = whole[:, 1 + len(SITE_UNKNOWNS) :][:, back]
+        sheared = (np.arange(len(back)) == V_Y)[None, :, None]
         spread = spread - sheared * spread[:, -1, None]
-        return barrier(Lift(whole[:, 0], whole[:, 1 : 1 + len(SEEN)], spread))
+        return barrier(Lift(whole[:, 0], whole[:, 1 : 1 + len(SITE_UNKNOWNS)], spread))
 
 
 class Lift(eqx.Module):
-    """All unknowns from z: x = shift + slope z, and a spread for given z; lanes last.
+    """All unknowns from z: x = shift + slope z, and a spread for given z; batch axis last.
 
     Attributes:
         shift: x at z = 0.
@@ -163,28 +161,28 @@ class Lift(eqx.Module):
         spread: covariance of x for given z.
     """
 
-    shift: Float[Array, "q lanes"]
-    slope: Float[Array, "q 6 lanes"]
-    spread: Float[Array, "q q lanes"]
+    shift: Float[Array, "q batch"]
+    slope: Float[Array, "q 6 batch"]
+    spread: Float[Array, "q q batch"]
 
     def __call__(
-        self, mean: Float[Array, "6 k lanes"], covariance: Float[Array, "6 6 k lanes"]
-    ) -> tuple[Float[Array, "q k lanes"], Float[Array, "q q k lanes"]]:
+        self, mean: Float[Array, "6 k batch"], covariance: Float[Array, "6 6 k batch"]
+    ) -> tuple[Float[Array, "q k batch"], Float[Array, "q q k batch"]]:
         """Mean and covariance of all unknowns from those of z."""
         slope = self.slope[:, :, None]
-        found = self.shift[:, None] + dense.product_lanes_last(slope, mean)
-        across = barrier(dense.product_lanes_last(slope, covariance))
+        found = self.shift[:, None] + dense.product_batch_last(slope, mean)
+        across = barrier(dense.product_batch_last(slope, covariance))
         back = jnp.swapaxes(slope, 0, 1)
-        return found, self.spread[:, :, None] + dense.product_lanes_last(across, back)
+        return found, self.spread[:, :, None] + dense.product_batch_last(across, back)
 
 
 def marginal(
-    information: Float[Array, "triangle lanes"],
-    gradient: Float[Array, "p lanes"],
-    precision: Float[Array, " lanes"],
-    mean: Float[Array, " lanes"],
+    information: Float[Array, "triangle batch"],
+    gradient: Float[Array, "p batch"],
+    precision: Float[Array, " batch"],
+    mean: Float[Array, " batch"],
 ) -> Marginal:
-    """Eliminate the unknowns that z leaves out (:func:`hidden`).
+    """Eliminate the unknowns that z leaves out (:func:`eliminated`).
 
     Args:
         information: of X, the target and the further unknowns in the measurements, upper triangle.
@@ -194,9 +192,9 @@ def marginal(
     """
     unknowns = gradient.shape[0]
     # With v_y = s - b, b has the rows and columns of v_y, with the opposite sign.
-    order = np.array([*hidden(unknowns), *SEEN])
+    order = np.array([*eliminated(unknowns), *SITE_UNKNOWNS])
     is_mean = order == unknowns
-    from_flat = np.where(is_mean, ELEVATION, order)
+    from_flat = np.where(is_mean, V_Y, order)
     places = square_places(unknowns)[np.ix_(from_flat, from_flat)]
     sign = np.where(is_mean, -1, 1).astype(information.dtype)
     last = is_mean[:, None, None] & is_mean[:, None]
@@ -204,16 +202,16 @@ def marginal(
     full = full + jnp.where(last, precision, 0.0)
     force = -picked(gradient, from_flat) * sign[:, None]
     force = force - jnp.where(is_mean[:, None], precision * mean, 0.0)
-    count = len(order) - len(SEEN)
+    count = len(order) - len(SITE_UNKNOWNS)
     own, mixed, left = barrier((full[:count, :count], full[:count, count:], full[count:, count:]))
-    spread, _ = dense.inverse_lanes_last(own)
-    slope = barrier(-dense.product_lanes_last(spread, mixed))
+    spread, _ = dense.inverse_batch_last(own)
+    slope = barrier(-dense.product_batch_last(spread, mixed))
     pull = force[:count]
     return barrier(
         Marginal(
-            left + dense.product_lanes_last(jnp.swapaxes(mixed, 0, 1), slope),
-            force[count:] + dense.product_lanes_last(jnp.swapaxes(slope, 0, 1), pull),
-            dense.product_lanes_last(spread, pull),
+            left + dense.product_batch_last(jnp.swapaxes(mixed, 0, 1), slope),
+            force[count:] + dense.product_batch_last(jnp.swapaxes(slope, 0, 1), pull),
+            dense.product_batch_last(spread, pull),
             slope,
             spread,
         )
@@ -230,19 +228,19 @@ class Posterior(eqx.Module):
         change: length of the last sweep's move of the mean, in SDs.
     """
 
-    mean: Float[Array, "6 k lanes"]
-    covariance: Float[Array, "6 6 k lanes"]
-    log_evidence: Float[Array, "k lanes"]
-    change: Float[Array, "k lanes"]
+    mean: Float[Array, "6 k batch"]
+    covariance: Float[Array, "6 6 k batch"]
+    log_evidence: Float[Array, "k batch"]
+    change: Float[Array, "k batch"]
 
 
 def propagate(
     known: Marginal,
     sites: Sites,
-    squares: Float[Array, "6 6 lanes"],
-    pull: Float[Array, "6 lanes"],
+    squares: Float[Array, "6 6 batch"],
+    pull: Float[Array, "6 batch"],
     families: Sequence[Family],
-    sd: Float[Array, "k lanes"],
+    sd: Float[Array, "k batch"],
     sweeps: int = SWEEPS,
 ) -> Posterior:
     """Belief and evidence under every law, one law after the other.
@@ -295,13 +293,13 @@ def propagate(
 
 
 class _Belief(eqx.Module):
-    covariance: Float[Array, "6 6 lanes"]
-    mean: Float[Array, "6 lanes"]
-    information: Float[Array, "6 6 lanes"]
-    rhs: Float[Array, "6 lanes"]
-    log_determinant: Float[Array, " lanes"]
+    covariance: Float[Array, "6 6 batch"]
+    mean: Float[Array, "6 batch"]
+    information: Float[Array, "6 6 batch"]
+    rhs: Float[Array, "6 batch"]
+    log_determinant: Float[Array, " batch"]
 
-    def evidence(self, site: Float[Array, " lanes"]) -> Float[Array, " lanes"]:
+    def evidence(self, site: Float[Array, " batch"]) -> Float[Array, " batch"]:
         """The log evidence, from the sites' part of it."""
         gained = jnp.sum(self.rhs * self.mean, axis=0)
         return site + 0.5 * gained - 0.5 * self.log_determinant
@@ -310,31 +308,31 @@ class _Belief(eqx.Module):
 class _Propagation(eqx.Module):
     """The sites (tau, nu) of every image, and the belief that they make."""
 
-    tau: Float[Array, "lanes n"]
-    nu: Float[Array, "lanes n"]
+    tau: Float[Array, "batch n"]
+    nu: Float[Array, "batch n"]
     belief: _Belief
 
 
 class _Found(eqx.Module):
-    mean: Float[Array, "6 lanes"]
-    covariance: Float[Array, "6 6 lanes"]
-    log_evidence: Float[Array, " lanes"]
-    change: Float[Array, " lanes"]
+    mean: Float[Array, "6 batch"]
+    covariance: Float[Array, "6 6 batch"]
+    log_evidence: Float[Array, " batch"]
+    change: Float[Array, " batch"]
 
 
-def seen(
-    squares: Float[Array, "triangle lanes"], pull: Float[Array, "p lanes"]
-) -> tuple[Float[Array, "6 6 lanes"], Float[Array, "6 lanes"]]:
+def site_part(
+    squares: Float[Array, "triangle batch"], pull: Float[Array, "p batch"]
+) -> tuple[Float[Array, "6 6 batch"], Float[Array, "6 batch"]]:
     """The parts for z of sums of h_i h_i' (upper triangle) and h_i o_i over all unknowns."""
-    at = np.array(SEEN)
+    at = np.array(SITE_UNKNOWNS)
     return picked(squares, square_places(pull.shape[0])[np.ix_(at, at)]), picked(pull, at)
 
 
-def _solved(information: Float[Array, "6 6 lanes"], rhs: Float[Array, "6 lanes"]) -> _Belief:
+def _solved(information: Float[Array, "6 6 batch"], rhs: Float[Array, "6 batch"]) -> _Belief:
     """The Gaussian of an information matrix and a right-hand side."""
     information, rhs = barrier((information, rhs))
-    covariance, log_determinant = barrier(dense.inverse_lanes_last(information))
-    mean = dense.product_lanes_last(covariance, rhs)
+    covariance, log_determinant = barrier(dense.inverse_batch_last(information))
+    mean = dense.product_batch_last(covariance, rhs)
     return barrier(_Belief(covariance, mean, information, rhs, log_determinant))
 
 
@@ -344,10 +342,10 @@ class _Laws(eqx.Module):
     families: Sequence[Family] = eqx.field(static=True)
     sites: Sites
     known: Marginal
-    squares: Float[Array, "6 6 lanes"]
-    pull: Float[Array, "6 lanes"]
+    squares: Float[Array, "6 6 batch"]
+    pull: Float[Array, "6 batch"]
 
-    def gaussian(self, sd: Float[Array, " lanes"]) -> _Propagation:
+    def gaussian(self, sd: Float[Array, " batch"]) -> _Propagation:
         """The sites of the Gaussian law."""
         tau = self.sites.used / (sd * sd)[:, None]
         belief = _solved(
@@ -355,7 +353,7 @@ class _Laws(eqx.Module):
         )
         return _Propagation(tau, jnp.zeros_like(tau), belief)
 
-    def under_gaussian(self, sd: Float[Array, " lanes"]) -> _Found:
+    def under_gaussian(self, sd: Float[Array, " batch"]) -> _Found:
         """The result under the Gaussian law itself."""
         belief = self.gaussian(sd).belief
         used, square = total([self.sites.used, self.sites.used * self.sites.offset**2])
@@ -363,18 +361,18 @@ class _Laws(eqx.Module):
         return _Found(belief.mean, belief.covariance, belief.evidence(site), jnp.zeros_like(sd))
 
     def swept(
-        self, family: Array, sd: Float[Array, " lanes"], state: _Propagation, sweeps: int
+        self, family: Array, sd: Float[Array, " batch"], state: _Propagation, sweeps: int
     ) -> tuple[_Propagation, _Found]:
         """Take ``sweeps`` sweeps under a law; the evidence is that before the last one."""
 
         def sweep(_: Array, carry: tuple) -> tuple:
             before, _ = carry
-            after, evidence, crowded = self.sweep(family, sd, before)
+            after, evidence, dominated = self.sweep(family, sd, before)
             step = after.belief.mean - before.belief.mean
             length = jnp.sum(
-                step * dense.product_lanes_last(after.belief.information, step), axis=0
+                step * dense.product_batch_last(after.belief.information, step), axis=0
             )
-            change = jnp.where(crowded, jnp.inf, jnp.sqrt(jnp.maximum(length, 0.0)))
+            change = jnp.where(dominated, jnp.inf, jnp.sqrt(jnp.maximum(length, 0.0)))
             return after, (evidence, change)
 
         none = jnp.zeros_like(sd)
@@ -382,7 +380,7 @@ class _Laws(eqx.Module):
         return state, _Found(state.belief.mean, state.belief.covariance, evidence, change)
 
     def sweep(
-        self, family: Array, sd: Float[Array, " lanes"], state: _Propagation
+        self, family: Array, sd: Float[Array, " batch"], state: _Propagation
     ) -> tuple[_Propagation, Array, Array]:
         """Update all sites once; the log evidence before, and where a site dominates the others."""
         h, offset, used = self.sites.direction, self.sites.offset, self.sites.used
@@ -404,23 +402,23 @@ class _Laws(eqx.Module):
         site = found.fall + jnp.log(found.mass * jnp.sqrt(joined))
         site = site - 0.5 * ((centre + without * nu) ** 2 / joined - centre**2) / without
         site = site + nu * offset - 0.5 * tau * offset**2
-        crowded = jnp.where(tau * without > 0.99 / LEAST_ROOM, used, 0.0)
+        dominated = jnp.where(tau * without > 0.99 / LEAST_ROOM, used, 0.0)
 
         new_tau, new_nu = refreshed(found, centre, without)
         tau = tau + DAMPING * used * (new_tau - tau)
         nu = nu + DAMPING * used * (new_nu - nu)
-        tau, nu, site, crowded = barrier((tau, nu, used * site, crowded))
+        tau, nu, site, dominated = barrier((tau, nu, used * site, dominated))
         weighted = [tau * row for row in h]
         force = nu - tau * offset
         planes = [weighted[i] * h[j] for i, j in TRIANGLE]
-        *sums, site, crowded = total([*planes, *(force * row for row in h), site, crowded])
+        *sums, site, dominated = total([*planes, *(force * row for row in h), site, dominated])
         evidence = belief.evidence(site)
         size = len(TRIANGLE)
         after = _solved(
             self.known.information + stacked(unrolled.as_array(sums[:size])),
             self.known.gradient + unrolled.as_array(sums[size:]),
         )
-        return _Propagation(tau, nu, after), evidence, crowded > 0
+        return _Propagation(tau, nu, after), evidence, dominated > 0
 
 
 def refreshed(found: Moments, centre: Array, without: Array) -> tuple[Array, Array]:

@@ -36,19 +36,19 @@ from jaxcal.runtime.array_types import AnyArray
 from jaxcal.runtime.arrays import is_traced
 from jaxcal.runtime.given_values import real_array, whole_number
 from jaxcal.solvers.levenberg_marquardt import (
-    IDLE,
     LARGEST_DAMPING,
+    MOST_STALLED,
     Descent,
     Rounding,
     default_tolerance,
     iterate_once,
 )
-from jaxcal.solvers.normal_equations import Normal
+from jaxcal.solvers.normal_equations import NormalEquations
 from jaxcal.solvers.plan import MOST_STEPS
 
 
 class Flat(eqx.Module):
-    """Unknowns of one lane as a vector, and a local unknown a row where there are some.
+    """Unknowns of one problem as a vector, and a local unknown a row where there are some.
 
     Attributes:
         shared: the unknowns.
@@ -122,14 +122,14 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         descent, rounding, aux = state
         _, unravel = ravel_pytree(y)
 
-        def equations(place: Flat, exact: Array) -> Normal:
+        def equations(iterate: Flat, exact: Array) -> NormalEquations:
             def residual(shared: Array) -> Array:
                 return ravel_pytree(fn(unravel(shared), args)[0])[0]
 
-            return _normal(residual, place.shared[:, 0])
+            return _normal(residual, iterate.shared[:, 0])
 
         after = iterate_once(descent, equations, rounding, self.tolerance, 2**30, exact_below=0.0)
-        found = unravel(after.place.shared[:, 0])
+        found = unravel(after.iterate.shared[:, 0])
         return found, (after, rounding, aux), aux
 
     def terminate(
@@ -137,9 +137,9 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     ) -> tuple[Bool[Array, ""], optx.RESULTS]:
         descent, _, _ = state
         done = jnp.logical_not(descent.active[0])
-        lost = done & jnp.logical_not(descent.settled[0])
+        failed = done & jnp.logical_not(descent.converged[0])
         result = optx.RESULTS.where(
-            lost, optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful
+            failed, optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful
         )
         return done, result
 
@@ -157,17 +157,17 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         return y, fn(y, args)[1], {}
 
 
-def _normal(residual: Callable[[Array], Array], here: Float[Array, " p"]) -> Normal:
-    """Gauss-Newton's normal equations of dense residuals, as those of one lane."""
+def _normal(residual: Callable[[Array], Array], here: Float[Array, " p"]) -> NormalEquations:
+    """Gauss-Newton's normal equations of dense residuals, as those of a batch of one."""
     value, push = jax.linearize(residual, here)
     jacobian = jax.vmap(push)(jnp.eye(here.shape[0], dtype=here.dtype))
     return _packed(jacobian @ jacobian.T, jacobian @ value, jnp.sum(value**2), None)
 
 
-def _packed(matrix: Array, gradient: Array, cost: Array, squares: Array | None) -> Normal:
+def _packed(matrix: Array, gradient: Array, cost: Array, squares: Array | None) -> NormalEquations:
     upper = matrix[np.triu_indices(len(matrix))]
     wide = None if squares is None else squares[:, None]
-    return Normal(upper[:, None], gradient[:, None], cost[None], wide)
+    return NormalEquations(upper[:, None], gradient[:, None], cost[None], wide)
 
 
 def arrow_least_squares(
@@ -251,9 +251,9 @@ class _ArrowSolver(LevenbergMarquardt):
         self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any
     ) -> tuple[Descent, Rounding, Any]:
         value, aux = fn(y, args)
-        place = self._at(fn, y, args)[0]
-        state = Descent.before(place, jnp.zeros(1, place.shared.dtype), self.damping)
-        rounding = jnp.finfo(place.shared.dtype).eps * jnp.max(jnp.abs(value))[None]
+        iterate = self._at(fn, y, args)[0]
+        state = Descent.before(iterate, jnp.zeros(1, iterate.shared.dtype), self.damping)
+        rounding = jnp.finfo(iterate.shared.dtype).eps * jnp.max(jnp.abs(value))[None]
         return state, Rounding(rounding, 0.0 * rounding), aux
 
     def step(self, fn: Any, y: Any, args: Any, options: Any, state: Any, tags: Any) -> tuple:
@@ -263,25 +263,26 @@ class _ArrowSolver(LevenbergMarquardt):
         # The candidate's own derivatives say how its local unknowns follow the next step.
         descent = eqx.tree_at(lambda state: state.candidate, descent, candidate)
         after = iterate_once(
-            descent, lambda place, exact: normal, rounding, self.tolerance, 2**30, exact_below=0.0
+            descent, lambda iterate, exact: normal, rounding, self.tolerance, 2**30, exact_below=0.0
         )
-        place = after.place
+        iterate = after.iterate
         # A step knows of the shared unknowns' gradient alone. Where that is zero, the local ones
         # may be far from their minimum still.
-        still = place.local_cosine
-        stuck = (after.idle >= IDLE) | (after.damping > LARGEST_DAMPING)
+        still = iterate.local_cosine
+        stopped = (after.stalled >= MOST_STALLED) | (after.damping > LARGEST_DAMPING)
         after = eqx.tree_at(
-            lambda state: (state.active, state.settled),
+            lambda state: (state.active, state.converged),
             after,
             (
-                after.active | (still > self.tolerance) & jnp.logical_not(stuck),
-                after.settled & ((still <= 10 * self.tolerance) | (after.idle >= IDLE)),
+                after.active | (still > self.tolerance) & jnp.logical_not(stopped),
+                after.converged
+                & ((still <= 10 * self.tolerance) | (after.stalled >= MOST_STALLED)),
             ),
         )
-        return (place.shared[:, 0], place.local[:, 0]), (after, rounding, aux), aux
+        return (iterate.shared[:, 0], iterate.local[:, 0]), (after, rounding, aux), aux
 
-    def _at(self, fn: Any, y: tuple[Array, Array], args: Any) -> tuple[Flat, Normal]:
-        """The place with its derivatives, and the normal equations without local unknowns."""
+    def _at(self, fn: Any, y: tuple[Array, Array], args: Any) -> tuple[Flat, NormalEquations]:
+        """The unknowns with their derivatives, and the normal equations without local unknowns."""
 
         def residual(shared: Array, local: Array) -> Array:
             return fn((shared, local), args)[0]
@@ -307,7 +308,7 @@ class _ArrowSolver(LevenbergMarquardt):
             cost,
             jnp.diagonal(shared),
         )
-        place = Flat(
+        iterate = Flat(
             y[0][:, None],
             y[1][:, None],
             (give[:, None] * coupling)[..., None],
@@ -315,4 +316,4 @@ class _ArrowSolver(LevenbergMarquardt):
             self.limit[:, None],
             jnp.max(cosine, initial=0.0)[None],
         )
-        return place, normal
+        return iterate, normal

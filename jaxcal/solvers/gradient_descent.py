@@ -20,8 +20,8 @@ from jaxtyping import Array, Float
 
 from jaxcal.model.batch import ImagePlanes, Iterate
 from jaxcal.model.observations import Further, InPlane
-from jaxcal.solvers.other import Fit
 from jaxcal.solvers.plan import Options
+from jaxcal.solvers.with_optimistix import Fit
 
 
 class SteepestDescent(optx.AbstractGradientDescent):
@@ -35,11 +35,13 @@ class SteepestDescent(optx.AbstractGradientDescent):
     verbose: Callable[..., None] = eqx.field(static=True, default=lambda **_: None)
 
 
-def reconstructed(place: Iterate, images: ImagePlanes) -> Float[Array, "3 lanes n"]:
+def reconstructed(iterate: Iterate, images: ImagePlanes) -> Float[Array, "3 batch n"]:
     """B_i X p_i, the target as reconstructed from every image, in the tracker's frame, mm."""
-    lateral, distance = Further.at(place).points(images)
-    in_probe = place.rotation[:, 0, :, None] * lateral + place.rotation[:, 2, :, None] * distance
-    in_probe = in_probe + place.translation[..., None]
+    lateral, distance = Further.at(iterate).points(images)
+    in_probe = (
+        iterate.rotation[:, 0, :, None] * lateral + iterate.rotation[:, 2, :, None] * distance
+    )
+    in_probe = in_probe + iterate.translation[..., None]
     poses = images.rotation.reshape(3, 3, *images.mask.shape)
     return jnp.sum(poses * in_probe, axis=1) + images.origin
 
@@ -49,7 +51,7 @@ def pairwise_gradient(start: Iterate, images: ImagePlanes, options: Options) -> 
 
     Args:
         start: first value of the unknowns; pixel scales are held.
-        images: the data, of one lane.
+        images: the data, a batch of one.
         options: the descent stops after a step that lowers the objective by less than the share
             ``gradient_tolerance`` and moves X by less than that share of a radian, or of the lever
             arm.
@@ -65,12 +67,12 @@ def pairwise_gradient(start: Iterate, images: ImagePlanes, options: Options) -> 
     def moved(tangent: Float[Array, 6]) -> Iterate:
         return start.moved(jnp.concatenate([unit * tangent, rest])[:, None])
 
-    def target(place: Iterate) -> Float[Array, "3 lanes"]:
-        return jnp.sum(images.mask * reconstructed(place, images), axis=2) / count
+    def target(iterate: Iterate) -> Float[Array, "3 batch"]:
+        return jnp.sum(images.mask * reconstructed(iterate, images), axis=2) / count
 
     def cost(tangent: Float[Array, 6], _: None) -> Float[Array, ""]:
-        place = moved(tangent)
-        away = reconstructed(place, images) - target(place)[..., None]
+        iterate = moved(tangent)
+        away = reconstructed(iterate, images) - target(iterate)[..., None]
         # The mean over pairs in units of the lever arm: an objective of order one.
         return jnp.sum(images.mask * away**2) / jnp.sum(count * lever**2)
 
@@ -83,6 +85,6 @@ def pairwise_gradient(start: Iterate, images: ImagePlanes, options: Options) -> 
     )
     steps = 100 * options.max_iterations
     found = optx.minimise(cost, solver, jnp.zeros(6, lever.dtype), max_steps=steps, throw=False)
-    place = moved(found.value)
-    place = eqx.tree_at(lambda it: it.point, place, target(place))
-    return Fit.of(found, place, start, InPlane.of(images), images, None, options.trace)
+    iterate = moved(found.value)
+    iterate = eqx.tree_at(lambda it: it.point, iterate, target(iterate))
+    return Fit.of(found, iterate, start, InPlane.of(images), images, None, options.trace)

@@ -32,107 +32,107 @@ STILL_MM, STILL_RAD = 1e-6, 1e-8
 
 
 @jax.custom_jvp
-def optimum(
-    place: Iterate, observation: Observation, images: ImagePlanes, medium: MediumPrior | None
-) -> Float[Array, "p lanes"]:
+def implicit_tangent(
+    iterate: Iterate, observation: Observation, images: ImagePlanes, medium: MediumPrior | None
+) -> Float[Array, "p batch"]:
     """How the minimiser of an objective moves with the data and with given numbers.
 
     Args:
-        place: the solution (not differentiated).
+        iterate: the solution (not differentiated).
         observation: the objective.
         images: the data.
-        medium: what is known of sound speed and delay beforehand.
+        medium: prior of sound speed and delay, or None.
 
     Returns:
         The step of the unknowns about the solution; zero in value.
     """
     del observation, images, medium
-    return _no_step(place)
+    return _no_step(iterate)
 
 
-@optimum.defjvp
+@implicit_tangent.defjvp
 @in_standard_promotion
-def _optimum_jvp(primals: tuple, tangents: tuple) -> tuple:
-    place, observation, images, medium = primals
+def _implicit_jvp(primals: tuple, tangents: tuple) -> tuple:
+    iterate, observation, images, medium = primals
 
     def gradient(
         observation: Observation, images: ImagePlanes, medium: MediumPrior | None
     ) -> Array:
-        return accumulate(place, observation, images, None, medium).gradient
+        return accumulate(iterate, observation, images, None, medium).gradient
 
     _, moved = jax.jvp(gradient, primals[1:], tangents[1:])
     exact = jnp.ones_like(images.mask[:, 0])
-    matrix = accumulate(place, observation, images, exact, medium).stacked()
-    inverse, _ = dense.inverse_lanes_last(matrix)
-    return optimum(*primals), -dense.product_lanes_last(inverse, moved)
+    matrix = accumulate(iterate, observation, images, exact, medium).stacked()
+    inverse, _ = dense.inverse_batch_last(matrix)
+    return implicit_tangent(*primals), -dense.product_batch_last(inverse, moved)
 
 
 @jax.custom_jvp
-def self_tuned_optimum(
-    place: Iterate,
-    sigma: Float[Array, "k lanes"],
+def self_tuned_tangent(
+    iterate: Iterate,
+    sigma: Float[Array, "k batch"],
     observation: Observation,
     images: ImagePlanes,
     medium: MediumPrior | None,
-) -> tuple[Float[Array, "p lanes"], Float[Array, "k lanes"]]:
+) -> tuple[Float[Array, "p batch"], Float[Array, "k batch"]]:
     """How a self-tuned solution and its SDs move with the data.
 
     Args:
-        place: the solution (not differentiated).
+        iterate: the solution (not differentiated).
         sigma: its SDs, mm (not differentiated).
         observation: the objective; its SDs are held where too few images determine them.
         images: the data.
-        medium: what is known of sound speed and delay beforehand.
+        medium: prior of sound speed and delay, or None.
 
     Returns:
         The step of the unknowns about the solution (zero in value), and the SDs.
     """
     del observation, images, medium
-    return _no_step(place), sigma
+    return _no_step(iterate), sigma
 
 
-@self_tuned_optimum.defjvp
+@self_tuned_tangent.defjvp
 @in_standard_promotion
 def _self_tuned_jvp(primals: tuple, tangents: tuple) -> tuple:
-    place, sigma, *data = primals
-    count = place.unknowns
+    iterate, sigma, *data = primals
+    count = iterate.unknowns
 
     def conditions(unknowns: Array, *data) -> Array:
-        moved, log_sigma = place.moved(unknowns[:count]), unknowns[count:]
+        moved, log_sigma = iterate.moved(unknowns[:count]), unknowns[count:]
         normal, updated = reml.update_at(moved, jnp.exp(log_sigma), *data)
         return jnp.concatenate([normal.gradient, log_sigma - jnp.log(updated)])
 
-    here = jnp.concatenate([_no_step(place), jnp.log(sigma)])
+    here = jnp.concatenate([_no_step(iterate), jnp.log(sigma)])
 
     def along(direction: Array) -> Array:
         moving = jnp.broadcast_to(direction[:, None], here.shape)
         return jax.jvp(lambda unknowns: conditions(unknowns, *data), (here,), (moving,))[1]
 
-    # By rows: condition, unknown, lane.
+    # Axes: condition, unknown, batch.
     matrix = jnp.moveaxis(jax.vmap(along)(jnp.eye(len(here), dtype=here.dtype)), 0, 1)
     _, moved = jax.jvp(lambda *data: conditions(here, *data), tuple(data), tuple(tangents[2:]))
     # The gradients' rows scale with 1/sigma^2, those of the SDs have no unit: balance the rows.
     scale = 1 / jnp.max(jnp.abs(matrix), axis=1)
     inverse = jax.vmap(dense.inverse, in_axes=-1, out_axes=-1)(scale[:, None] * matrix)
-    step = -dense.product_lanes_last(inverse, scale * moved)
-    return self_tuned_optimum(*primals), (step[:count], sigma * step[count:])
+    step = -dense.product_batch_last(inverse, scale * moved)
+    return self_tuned_tangent(*primals), (step[:count], sigma * step[count:])
 
 
 @jax.custom_jvp
-def stopped_short(
-    place: Iterate, observation: Observation, images: ImagePlanes
-) -> Float[Array, "p lanes"]:
-    """:func:`optimum` of a method that stopped before the minimum: to differentiate it is an error.
+def undefined_tangent(
+    iterate: Iterate, observation: Observation, images: ImagePlanes
+) -> Float[Array, "p batch"]:
+    """:func:`implicit_tangent` of a method that stopped before the minimum, where it is undefined.
 
     Raises:
-        InputError: where it is differentiated, with what to do.
+        InputError: when it is differentiated, with what to do.
     """
     del observation, images
-    return _no_step(place)
+    return _no_step(iterate)
 
 
-@stopped_short.defjvp
-def _stopped_short_jvp(primals: tuple, tangents: tuple) -> tuple:
+@undefined_tangent.defjvp
+def _undefined_jvp(primals: tuple, tangents: tuple) -> tuple:
     raise InputError(
         "the alternation stops before the minimum, where its answer has no derivative: "
         'differentiate method="joint" with prior="bounded", which has the same objective, or the '
@@ -141,8 +141,8 @@ def _stopped_short_jvp(primals: tuple, tangents: tuple) -> tuple:
     )
 
 
-def _no_step(place: Iterate) -> Float[Array, "p lanes"]:
-    # These zeros must depend on the lane: where a custom rule's tangent is batched and its value is
-    # not, JAX (0.10.2) confuses the two when it linearises a scan over batches.
-    zero = jnp.where(jnp.isfinite(place.translation[0]), 0.0, 0.0).astype(place.point.dtype)
-    return jnp.broadcast_to(zero, (place.unknowns, *zero.shape))
+def _no_step(iterate: Iterate) -> Float[Array, "p batch"]:
+    # These zeros must depend on a batched array: where a custom rule's tangent is batched and its
+    # value is not, JAX (0.10.2) confuses the two when it linearises a scan over batches.
+    zero = jnp.where(jnp.isfinite(iterate.translation[0]), 0.0, 0.0).astype(iterate.point.dtype)
+    return jnp.broadcast_to(zero, (iterate.unknowns, *zero.shape))

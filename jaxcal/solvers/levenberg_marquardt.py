@@ -1,21 +1,21 @@
 """Levenberg-Marquardt on many problems side by side, one pass over the images an iteration.
 
-Every lane has its own damping, gate and stopping rule; a lane that has converged keeps its answer
-while the others go on. An iteration evaluates every lane's candidate: the cost decides whether the
-candidate is taken, and the same sums are the normal equations for the next one. The first candidate
-is the start, so that only one loop body has to be compiled.
+Every problem has its own damping, curvature and stopping rule; one that has converged keeps its
+answer while the others go on. An iteration evaluates every problem's candidate: the cost decides
+whether the candidate is taken, and the same sums are the normal equations for the next one. The
+first candidate is the start, so that only one loop body has to be compiled.
 
 The acceptance rule is that of More (1978) with Nielsen's (1999) constants: a step is taken where
 the cost falls by at least a ten-thousandth of the decrease that the quadratic model predicts. The
 damping falls where the cost falls by at least a quarter of it, and grows tenfold where a step is
 refused. Every loop of the package uses this rule, by :func:`judge_step`. Steps are Gauss-Newton's
 where the gradient cosine is above :data:`EXACT_BELOW`, and exact Newton steps below it; where the
-exact matrix is indefinite, the same place is evaluated again without second derivatives.
+exact matrix is indefinite, the same iterate is evaluated again without second derivatives.
 
-A lane stops when the largest cosine between its residual and a column of its Jacobian is below the
-tolerance, when its residuals are nothing but rounding, or when steps gain no more than rounding.
-Newton's steps square the cosine. So where its square is well below the tolerance, one last step is
-taken, and its result is not evaluated.
+A problem stops when the largest cosine between its residual and a column of its Jacobian is below
+the tolerance, when its residuals are nothing but rounding, or when steps gain no more than
+rounding. Newton's steps square the cosine. So where its square is well below the tolerance, one
+last step is taken, and its result is not evaluated.
 
 The loop needs normal equations and a retraction, not residuals; :mod:`jaxcal.solvers.general` puts
 it behind optimistix's interface for residuals of any shape.
@@ -37,36 +37,36 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxcal.model.batch import ImagePlanes, Iterate, barrier, choose
 from jaxcal.model.observations import LocalUnknown, MediumPrior, Observation
 from jaxcal.solvers import dense
-from jaxcal.solvers.normal_equations import Normal, accumulate
+from jaxcal.solvers.normal_equations import NormalEquations, accumulate
 
-ENOUGH = 1e-4
-"""Share of the predicted decrease that a step has to bring to be taken."""
+ACCEPT_RATIO = 1e-4
+"""Least ratio of actual to predicted decrease with which a step is taken."""
 
-GOOD = 0.25
-"""Share of the predicted decrease above which the damping falls."""
+GOOD_RATIO = 0.25
+"""Least ratio of actual to predicted decrease with which the damping falls."""
 
-LESS, LESS_EXACT, MORE = 0.1, 1e-4, 10.0
-"""Factors of the damping after a good Gauss-Newton step, a good exact one, a refused one."""
+DAMPING_DECREASE, DAMPING_DECREASE_EXACT, DAMPING_INCREASE = 0.1, 1e-4, 10.0
+"""Factors on the damping after a good Gauss-Newton step, a good exact one, and a refused one."""
 
 LEAST_DAMPING, LARGEST_DAMPING = 1e-8, 1e12
-"""Least damping after a refused step, and the damping above which a lane gives up."""
+"""Least damping after a refused step, and the damping above which a problem is given up."""
 
 EXACT_BELOW = 0.2
 """Gradient cosine below which exact second derivatives are used."""
 
-SQUARED = 100.0
+QUADRATIC_FACTOR = 100.0
 """Assumed upper bound on the cosine after an exact Newton step over the square of the cosine before
 it. From a cosine below 1e-6, the worst of 1,024 simulated problems came to 2.3e-12."""
 
-SMALL = 1e-11
+FINAL_DECREASE = 1e-11
 """Largest predicted relative decrease of the cost by a last step that is not evaluated."""
 
-IDLE = 4
-"""Steps in a row without a gain above rounding before a lane is called settled."""
+MOST_STALLED = 4
+"""Successive steps without a gain above rounding after which a problem has converged."""
 
 
-Equations = Callable[[Any, Float[Array, " lanes"]], Normal]
-"""Normal equations at a place, with exact second derivatives where a gate is 1."""
+Equations = Callable[[Any, Float[Array, " batch"]], NormalEquations]
+"""From unknowns, and 1 where second derivatives are to be exact, to their normal equations."""
 
 
 class Judged(eqx.Module):
@@ -75,26 +75,26 @@ class Judged(eqx.Module):
     Attributes:
         accept: the step is taken.
         damping: Marquardt's lambda for the next step.
-        idle: steps in a row without a gain.
+        stalled: number of successive steps without a gain above rounding.
     """
 
-    accept: Bool[Array, " lanes"]
-    damping: Float[Array, " lanes"]
-    idle: Int[Array, " lanes"]
+    accept: Bool[Array, " batch"]
+    damping: Float[Array, " batch"]
+    stalled: Int[Array, " batch"]
 
 
 def judge_step(
-    decrease: Float[Array, " lanes"],
-    predicted: Float[Array, " lanes"],
-    half_cost: Float[Array, " lanes"],
-    rounding: Float[Array, " lanes"],
-    damping: Float[Array, " lanes"],
-    idle: Int[Array, " lanes"],
+    decrease: Float[Array, " batch"],
+    predicted: Float[Array, " batch"],
+    half_cost: Float[Array, " batch"],
+    rounding: Float[Array, " batch"],
+    damping: Float[Array, " batch"],
+    stalled: Int[Array, " batch"],
     *,
-    exact: Bool[Array, " lanes"],
-    retry: Bool[Array, " lanes"],
-    less_exact: float = LESS_EXACT,
-    allowance: Float[Array, " lanes"] | float = 0.0,
+    exact: Bool[Array, " batch"],
+    retry: Bool[Array, " batch"],
+    decrease_exact: float = DAMPING_DECREASE_EXACT,
+    allowance: Float[Array, " batch"] | float = 0.0,
 ) -> Judged:
     """The acceptance rule.
 
@@ -104,78 +104,78 @@ def judge_step(
         half_cost: before the step.
         rounding: of one whitened residual.
         damping: of the step.
-        idle: steps in a row without a gain before it.
+        stalled: number of successive steps without a gain before it.
         exact: the step came from exact second derivatives.
-        retry: there was no step; the same place was evaluated again.
-        less_exact: factor of the damping after a good exact step.
+        retry: there was no step; the same iterate was evaluated again.
+        decrease_exact: factor on the damping after a good exact step.
         allowance: by how much half the cost may have grown for other reasons than the step.
     """
     # Each residual is off by its rounding, so half their sum of squares is off by this much.
     noise = 8 * jnp.finfo(half_cost.dtype).eps * half_cost + 2 * rounding * jnp.sqrt(half_cost)
     least = -noise - allowance
-    accept = (decrease >= ENOUGH * predicted + least) | retry
-    good = (decrease >= GOOD * predicted + least) & jnp.logical_not(retry)
+    accept = (decrease >= ACCEPT_RATIO * predicted + least) | retry
+    good = (decrease >= GOOD_RATIO * predicted + least) & jnp.logical_not(retry)
     # The exact matrix needs no damping; Gauss-Newton's needs less and less.
-    factor = jnp.where(good, jnp.where(exact, less_exact, LESS), 1.0)
-    raised = jnp.maximum(MORE * damping, LEAST_DAMPING)
-    gained = jnp.where(decrease > noise, 0, idle + 1)
+    factor = jnp.where(good, jnp.where(exact, decrease_exact, DAMPING_DECREASE), 1.0)
+    raised = jnp.maximum(DAMPING_INCREASE * damping, LEAST_DAMPING)
+    gained = jnp.where(decrease > noise, 0, stalled + 1)
     return Judged(
         accept,
         jnp.where(accept, factor * damping, raised),
-        jnp.where(accept & jnp.logical_not(retry), gained, idle),
+        jnp.where(accept & jnp.logical_not(retry), gained, stalled),
     )
 
 
 class Descent(eqx.Module):
-    """The state of every lane.
+    """The state of every problem.
 
     Attributes:
-        place: the best so far.
-        cost: sum of squared (whitened) residuals at ``place``.
-        cosine: gradient cosine at ``place``; after a last step that was not evaluated, its bound.
-        candidate: the place to evaluate next.
-        retry: ``candidate`` is ``place`` again, with more damping or without second derivatives.
+        iterate: the best unknowns so far.
+        cost: sum of squared (whitened) residuals at ``iterate``.
+        cosine: gradient cosine at ``iterate``; after a last step that was not evaluated, its bound.
+        candidate: the unknowns to evaluate next.
+        retry: ``candidate`` is ``iterate`` again, with more damping or without second derivatives.
         exact_used: 1 where the step to the candidate came from an exact curvature.
         exact_next: 1 where the candidate's curvature is to be exact.
         damping: Marquardt's lambda.
         predicted: predicted decrease of half the cost by the step to the candidate.
-        idle: steps in a row without a gain.
+        stalled: number of successive steps without a gain above rounding.
         iterations: number of evaluations.
-        settled: converged, as far as rounding allows.
-        active: the lane goes on.
+        converged: the gradient cosine met its tolerance, or steps gain nothing above rounding.
+        active: the problem is not finished.
         trace: best cost after each of the first evaluations; NaN beyond the last; None: not kept.
     """
 
-    place: Any
-    cost: Float[Array, " lanes"]
-    cosine: Float[Array, " lanes"]
+    iterate: Any
+    cost: Float[Array, " batch"]
+    cosine: Float[Array, " batch"]
     candidate: Any
-    retry: Bool[Array, " lanes"]
-    exact_used: Float[Array, " lanes"]
-    exact_next: Float[Array, " lanes"]
-    damping: Float[Array, " lanes"]
-    predicted: Float[Array, " lanes"]
-    idle: Int[Array, " lanes"]
-    iterations: Int[Array, " lanes"]
-    settled: Bool[Array, " lanes"]
-    active: Bool[Array, " lanes"]
-    trace: Float[Array, "trace lanes"] | None = None
+    retry: Bool[Array, " batch"]
+    exact_used: Float[Array, " batch"]
+    exact_next: Float[Array, " batch"]
+    damping: Float[Array, " batch"]
+    predicted: Float[Array, " batch"]
+    stalled: Int[Array, " batch"]
+    iterations: Int[Array, " batch"]
+    converged: Bool[Array, " batch"]
+    active: Bool[Array, " batch"]
+    trace: Float[Array, "trace batch"] | None = None
 
     @classmethod
     def before(
-        cls, start: Any, number: Float[Array, " lanes"], damping: float, *, trace: int = 0
+        cls, start: Any, number: Float[Array, " batch"], damping: float, *, trace: int = 0
     ) -> Descent:
         """The state before the first evaluation.
 
         Args:
             start: the first candidate.
-            number: zeros of the lanes' shape.
+            number: zeros, one for every problem.
             damping: first lambda, relative to the diagonal.
             trace: how many values of the cost to keep.
         """
         no, count = jnp.zeros(number.shape, bool), jnp.zeros(number.shape, jnp.int32)
         return cls(
-            place=start,
+            iterate=start,
             cost=number + jnp.inf,
             cosine=number + jnp.inf,
             candidate=start,
@@ -184,61 +184,63 @@ class Descent(eqx.Module):
             exact_next=number,
             damping=number + damping,
             predicted=number,
-            idle=count,
+            stalled=count,
             iterations=count,
-            settled=no,
+            converged=no,
             active=~no,
             trace=empty_trace(trace, number),
         )
 
 
-def empty_trace(length: int, number: Float[Array, " lanes"]) -> Float[Array, "trace lanes"] | None:
-    """A trace without values, for lanes like those of ``number``; None for a length of 0."""
+def empty_trace(length: int, number: Float[Array, " batch"]) -> Float[Array, "trace batch"] | None:
+    """A trace without values, of the batch shape of ``number``; None for a length of 0."""
     return jnp.full((length, *number.shape), jnp.nan, number.dtype) if length else None
 
 
 def recorded(
-    trace: Float[Array, "trace lanes"] | None,
-    at: Int[Array, " lanes"],
-    cost: Float[Array, " lanes"],
-) -> Float[Array, "trace lanes"] | None:
-    """The trace with one more value in each lane; those beyond its end are not kept."""
+    trace: Float[Array, "trace batch"] | None,
+    at: Int[Array, " batch"],
+    cost: Float[Array, " batch"],
+) -> Float[Array, "trace batch"] | None:
+    """The trace with one more value of each problem; those beyond its end are not kept."""
     if trace is None:
         return None
     return jnp.where(jnp.arange(trace.shape[0])[:, None] == at, cost, trace)
 
 
 class Rounding(eqx.Module):
-    """Rounding errors of the residuals due to the size of the coordinates, in each lane.
+    """Rounding errors of the residuals due to the size of the coordinates, for each problem.
 
     Attributes:
         residual: rounding error of one whitened residual.
         vanished: the cost below which residuals are nothing but rounding.
     """
 
-    residual: Float[Array, " lanes"]
-    vanished: Float[Array, " lanes"]
+    residual: Float[Array, " batch"]
+    vanished: Float[Array, " batch"]
 
     @classmethod
     def of(cls, iterate: Iterate, observation: Observation, images: ImagePlanes) -> Rounding:
         """From the size of the coordinates."""
-        return cls.at(reach(iterate, images), observation.largest_weight(), images)
+        return cls.at(largest_coordinate(iterate, images), observation.largest_weight(), images)
 
     @classmethod
-    def at(cls, reach: Array, weight: Array, images: ImagePlanes) -> Rounding:
+    def at(cls, largest_coordinate: Array, weight: Array, images: ImagePlanes) -> Rounding:
         """From the size of the coordinates and the largest weight of a mm."""
-        one = jnp.finfo(reach.dtype).eps * reach * weight
+        one = jnp.finfo(largest_coordinate.dtype).eps * largest_coordinate * weight
         return cls(one, 3 * images.mask.shape[1] * (2 * one) ** 2)
 
 
-def reach(iterate: Iterate, images: ImagePlanes) -> Float[Array, " lanes"]:
-    """The largest coordinate of a lane's poses and target, mm."""
+def largest_coordinate(iterate: Iterate, images: ImagePlanes) -> Float[Array, " batch"]:
+    """The largest coordinate of a problem's poses and target, mm."""
     away = jnp.max(images.mask * jnp.max(jnp.abs(images.origin), axis=0), axis=1)
     return jnp.maximum(away, jnp.max(jnp.abs(iterate.point), axis=0))
 
 
-def gradient_cosine(normal: Normal, vanished: Float[Array, " lanes"]) -> Float[Array, " lanes"]:
-    """max_k |g_k| / (|J_k| |r|), 0 where the residuals vanish; NaN in a lost lane."""
+def gradient_cosine(
+    normal: NormalEquations, vanished: Float[Array, " batch"]
+) -> Float[Array, " batch"]:
+    """max_k |g_k| / (|J_k| |r|), 0 where the residuals vanish; NaN where the cost is not finite."""
     length = jnp.sqrt(jnp.abs(normal.diagonal()) * normal.cost)
     cosine = jnp.max(jnp.abs(normal.gradient) / jnp.where(length > 0, length, 1.0), axis=0)
     cosine = jnp.where(jnp.isfinite(normal.cost), cosine, jnp.nan)
@@ -246,22 +248,22 @@ def gradient_cosine(normal: Normal, vanished: Float[Array, " lanes"]) -> Float[A
 
 
 def damped_step(
-    normal: Normal, damping: Float[Array, " lanes"]
-) -> tuple[Float[Array, "p lanes"], Float[Array, " lanes"], Bool[Array, " lanes"]]:
-    """The damped step, the decrease of half the cost that it predicts, and where it is lost.
+    normal: NormalEquations, damping: Float[Array, " batch"]
+) -> tuple[Float[Array, "p batch"], Float[Array, " batch"], Bool[Array, " batch"]]:
+    """The damped step, the decrease of half the cost that it predicts, and where there is none.
 
-    A step is lost, and zero, where the matrix is not positive definite.
+    The step is zero where the matrix is not positive definite.
     """
     damping = damping + 16 * jnp.finfo(damping.dtype).eps
     diagonal = normal.diagonal()
     diagonal = jnp.where(diagonal > 0, diagonal, 1.0)
     eye = jnp.eye(len(diagonal), dtype=damping.dtype)[..., None]
     matrix, gradient = barrier((normal.stacked() + damping * diagonal * eye, normal.gradient))
-    move = barrier(dense.solve_lanes_last(matrix, -gradient))
-    lost = jnp.logical_not(jnp.isfinite(jnp.sum(move, axis=0)))
-    move = jnp.where(lost, 0.0, move)
+    move = barrier(dense.solve_batch_last(matrix, -gradient))
+    indefinite = jnp.logical_not(jnp.isfinite(jnp.sum(move, axis=0)))
+    move = jnp.where(indefinite, 0.0, move)
     held = damping * diagonal * move - normal.gradient
-    return barrier(move), 0.5 * jnp.sum(held * move, axis=0), lost
+    return barrier(move), 0.5 * jnp.sum(held * move, axis=0), indefinite
 
 
 def iterate_once(
@@ -272,13 +274,13 @@ def iterate_once(
     max_steps: int,
     *,
     undamped: bool = False,
-    less_exact: float = LESS_EXACT,
+    decrease_exact: float = DAMPING_DECREASE_EXACT,
     exact_below: float = EXACT_BELOW,
 ) -> Descent:
-    """Evaluate every active lane's candidate, and choose the next one.
+    """Evaluate every active problem's candidate, and choose the next one.
 
-    Normal equations are used at once and not stored: to evaluate a place again, where a step from
-    it has failed, is cheaper than to keep them for every lane.
+    Normal equations are used at once and not stored: to evaluate an iterate again, where a step
+    from it has failed, is cheaper than to keep them for every problem.
     """
     normal = barrier(equations(state.candidate, state.exact_next))
 
@@ -289,57 +291,57 @@ def iterate_once(
         half,
         rounding.residual,
         state.damping,
-        state.idle,
+        state.stalled,
         exact=state.exact_used > 0,
         retry=state.retry,
-        less_exact=less_exact,
+        decrease_exact=decrease_exact,
     )
-    accept, damping, idle = judged.accept, judged.damping, judged.idle
+    accept, damping, stalled = judged.accept, judged.damping, judged.stalled
     if undamped:
         accept, damping = jnp.isfinite(normal.cost), jnp.zeros_like(damping)
 
-    place = choose(accept & state.active, state.candidate, state.place)
+    iterate = choose(accept & state.active, state.candidate, state.iterate)
     cost = jnp.where(accept, normal.cost, state.cost)
     cosine = jnp.where(accept, gradient_cosine(normal, rounding.vanished), state.cosine)
-    move, predicted, lost = damped_step(normal, damping)
-    lost = lost & accept
-    # Indefinite: the same place again without second derivatives, or with more damping.
-    more = jnp.maximum(MORE * damping, LEAST_DAMPING)
-    damping = jnp.where(lost & (state.exact_next == 0), more, damping)
-    retry = lost | jnp.logical_not(accept)
-    candidate = choose(retry, place, state.candidate.moved(move))
+    move, predicted, indefinite = damped_step(normal, damping)
+    indefinite = indefinite & accept
+    # Indefinite: the same iterate again without second derivatives, or with more damping.
+    more = jnp.maximum(DAMPING_INCREASE * damping, LEAST_DAMPING)
+    damping = jnp.where(indefinite & (state.exact_next == 0), more, damping)
+    retry = indefinite | jnp.logical_not(accept)
+    candidate = choose(retry, iterate, state.candidate.moved(move))
 
     iterations = state.iterations + 1
-    stuck = (idle >= IDLE) | (damping > LARGEST_DAMPING) | (iterations >= max_steps)
-    left = SQUARED * cosine * cosine
-    last = (
+    stopped = (stalled >= MOST_STALLED) | (damping > LARGEST_DAMPING) | (iterations >= max_steps)
+    squared_cosine = QUADRATIC_FACTOR * cosine * cosine
+    final_step = (
         (state.exact_next > 0)
         & (damping < 1e-6)
         & jnp.logical_not(retry)
-        & (left <= tolerance)
-        & (predicted <= SMALL * cost)
+        & (squared_cosine <= tolerance)
+        & (predicted <= FINAL_DECREASE * cost)
         & (cosine > tolerance)
     )
-    exact_next = (cosine < exact_below) & jnp.logical_not(lost | undamped)
+    exact_next = (cosine < exact_below) & jnp.logical_not(indefinite | undamped)
     after = Descent(
-        place=place,
+        iterate=iterate,
         cost=cost,
-        cosine=jnp.where(last, left, cosine),
+        cosine=jnp.where(final_step, squared_cosine, cosine),
         candidate=candidate,
         retry=retry,
         exact_used=jnp.where(accept, state.exact_next, state.exact_used),
         exact_next=jnp.where(exact_next, 1.0, 0.0).astype(half.dtype),
         damping=damping,
         predicted=predicted,
-        idle=idle,
+        stalled=stalled,
         iterations=iterations,
-        settled=(cosine <= 10 * tolerance) | last | (idle >= IDLE),
-        active=(cosine > tolerance) & jnp.logical_not(stuck | last),
+        converged=(cosine <= 10 * tolerance) | final_step | (stalled >= MOST_STALLED),
+        active=(cosine > tolerance) & jnp.logical_not(stopped | final_step),
         trace=recorded(state.trace, state.iterations, cost),
     )
-    after = choose(state.active, after, eqx.tree_at(lambda old: old.place, state, place))
+    after = choose(state.active, after, eqx.tree_at(lambda old: old.iterate, state, iterate))
     return eqx.tree_at(
-        lambda new: new.place, after, choose(last & state.active, candidate, after.place)
+        lambda new: new.iterate, after, choose(final_step & state.active, candidate, after.iterate)
     )
 
 
@@ -354,20 +356,21 @@ def minimise(
     max_steps: int = 100,
     trace: int = 0,
 ) -> Descent:
-    """Minimise every lane's objective.
+    """Minimise every problem's objective.
 
     Args:
         start: unknowns to start from.
         observation: the objective.
         images: the data.
-        medium: what is known of sound speed and delay beforehand.
+        medium: prior of sound speed and delay, or None.
         damping: first lambda, relative to the diagonal; 0 for Gauss-Newton, which takes every step.
         tolerance: gradient cosine to stop at; by default 1e-10 in float64, 1e-4 in float32.
         max_steps: most passes.
         trace: how many values of the cost to keep.
 
     Returns:
-        Where every lane stopped.
+        The final state, for every problem: the unknowns (``iterate``), ``cost``, gradient cosine
+        (``cosine``), number of ``iterations``, whether it ``converged``, and the ``trace``.
     """
     if tolerance is None:
         tolerance = default_tolerance(images.mask.dtype)
@@ -375,13 +378,15 @@ def minimise(
     rounding = barrier(Rounding.of(start, observation, images))
     undamped = damping == 0
 
-    def equations(iterate: Iterate, exact: Array) -> Normal:
+    def equations(iterate: Iterate, exact: Array) -> NormalEquations:
         return accumulate(iterate, observation, images, None if undamped else exact, medium)
 
     begun = Descent.before(start, jnp.zeros_like(images.mask[:, 0]), damping, trace=trace)
     # The curvature jumps where offsets reach or leave their bounds, so a good exact step says
     # little about the next one.
-    less_exact = LESS if isinstance(observation, LocalUnknown) else LESS_EXACT
+    decrease_exact = (
+        DAMPING_DECREASE if isinstance(observation, LocalUnknown) else DAMPING_DECREASE_EXACT
+    )
 
     def one(state: Descent) -> Descent:
         return iterate_once(
@@ -391,12 +396,12 @@ def minimise(
             tolerance,
             max_steps,
             undamped=undamped,
-            less_exact=less_exact,
+            decrease_exact=decrease_exact,
         )
 
     return jax.lax.while_loop(lambda state: jnp.any(state.active), one, begun)
 
 
 def default_tolerance(dtype: jnp.dtype) -> float:
-    """Gradient cosine that a precision can reach."""
+    """Gradient cosine that the arithmetic of ``dtype`` can reach."""
     return 1e-10 if float(jnp.finfo(dtype).eps) < 1e-10 else 1e-4

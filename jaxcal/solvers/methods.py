@@ -36,37 +36,37 @@ from jaxcal.solvers.auto import average_over_laws
 from jaxcal.solvers.convergence import Convergence
 from jaxcal.solvers.gradient_descent import pairwise_gradient
 from jaxcal.solvers.levenberg_marquardt import Descent, minimise
-from jaxcal.solvers.other import Fit, minimise_with, self_tuned_with
 from jaxcal.solvers.plan import DEFAULT_MAX_ELEVATION_MM, Given, Options, SolvePlan
 from jaxcal.solvers.reml import SelfTuned, on_floor, self_tuned
 from jaxcal.solvers.start import ConventionalStart, GivenStart, conventional
+from jaxcal.solvers.with_optimistix import Fit, minimise_with, self_tuned_with
 
-HELD_SIGMA = (0.5, 0.5, 1.0)
+FALLBACK_SIGMA = (0.5, 0.5, 1.0)
 """SDs of lateral position, range and offset (mm), used where too few images determine them."""
 
-HELD_CHANNEL_SIGMA = (0.5, 1.0)
+FALLBACK_CHANNEL_SIGMA = (0.5, 1.0)
 """SDs of an element's distance and of the offset (mm), used in the same case."""
 
 
 class Solution(eqx.Module):
-    """Where a method stopped; lanes last, except in the law and the convergence.
+    """Where a method stopped; the batch axis is last, except in the law and the convergence.
 
     Attributes:
-        place: X, c and the further unknowns.
-        observation: the objective there, with its SDs.
-        medium: what was known of sound speed and delay beforehand, or None.
+        iterate: X, c and the further unknowns.
+        observation: the objective, with its SDs.
+        medium: prior of sound speed and delay, or None.
         convergence: how the method ended.
         covariance: of the unknowns over all laws of the offsets, where they were weighed.
         elevation_sd: SDs of the offsets over all laws, mm, where they were weighed.
         law: what was found out about the offsets' law, where laws were weighed.
     """
 
-    place: Iterate
+    iterate: Iterate
     observation: Observation
     medium: MediumPrior | None
     convergence: Convergence
-    covariance: Float[Array, "p p lanes"] | None = None
-    elevation_sd: Float[Array, "lanes n"] | None = None
+    covariance: Float[Array, "p p batch"] | None = None
+    elevation_sd: Float[Array, "batch n"] | None = None
     law: OffsetLaw | None = None
 
 
@@ -123,10 +123,10 @@ def observe(
         if bound is None:
             bound = jnp.full_like(images.mask, DEFAULT_MAX_ELEVATION_MM)
         return BoundedOffsets.of(bound, images), None
-    held = HELD_CHANNEL_SIGMA if plan.channels else HELD_SIGMA
+    fallback = FALLBACK_CHANNEL_SIGMA if plan.channels else FALLBACK_SIGMA
     dtype = images.mask.dtype
-    sigma = jnp.asarray(held, dtype) if given.sigma is None else given.sigma
-    sigma = jnp.broadcast_to(sigma[:, None], (len(held), images.lanes))
+    sigma = jnp.asarray(fallback, dtype) if given.sigma is None else given.sigma
+    sigma = jnp.broadcast_to(sigma[:, None], (len(fallback), images.batch_size))
     medium = None
     if given.medium_sd is not None and any(name in plan.blocks for name in MEDIUM):
         speed = problems.nominal_sound_speed
@@ -158,7 +158,7 @@ def run(
     observation, medium = observe(problems, images, given, plan)
     found = _descended(begun, observation, medium, images, plan)
     zero = jnp.zeros_like(found.cost)
-    floored, rounds = jnp.zeros((images.lanes, 3), bool), jnp.zeros_like(found.iterations)
+    floored, rounds = jnp.zeros((images.batch_size, 3), bool), jnp.zeros_like(found.iterations)
     if plan.self_tuning:
         assert isinstance(found, SelfTuned | Fit)
         observation = observation.with_sigma(found.updated)
@@ -172,7 +172,7 @@ def run(
     convergence = Convergence(
         cost=found.cost,
         stationarity=found.cosine,
-        tolerance_met=found.settled,
+        tolerance_met=found.converged,
         iterations=found.iterations,
         variance_rounds=rounds,
         searched_start=begun.searched,
@@ -181,7 +181,7 @@ def run(
         translation_change=moves[1],
         trace=None if found.trace is None else found.trace.T,
     )
-    return Solution(found.place, observation, medium, convergence)
+    return Solution(found.iterate, observation, medium, convergence)
 
 
 def _descended(
@@ -192,7 +192,7 @@ def _descended(
     plan: SolvePlan,
 ) -> Alternation | Descent | Fit | SelfTuned:
     """Where the plan's method stops."""
-    options, other, start = plan.options, plan.other_solver, begun.place
+    options, other, start = plan.options, plan.other_solver, begun.iterate
     limits = {"max_steps": options.max_iterations, "trace": options.trace}
     if plan.method == "conventional":
         assert isinstance(begun, ConventionalStart)
@@ -235,15 +235,15 @@ def _attached(
     """The solution as a differentiable function of the problems (and of given numbers)."""
     observation, medium = observe(problems, images, given, plan)
     if plan.self_tuning:
-        step, sigma = implicit.self_tuned_optimum(
-            found.place, found.observation.sigma, observation, images, medium
+        step, sigma = implicit.self_tuned_tangent(
+            found.iterate, found.observation.sigma, observation, images, medium
         )
         observation = observation.with_sigma(sigma)
     elif plan.method == "alternating" and not _ends_still(plan.options):
-        step = implicit.stopped_short(found.place, observation, images)
+        step = implicit.undefined_tangent(found.iterate, observation, images)
     else:
-        step = implicit.optimum(found.place, observation, images, medium)
-    return replace(found, place=found.place.moved(step), observation=observation, medium=medium)
+        step = implicit.implicit_tangent(found.iterate, observation, images, medium)
+    return replace(found, iterate=found.iterate.moved(step), observation=observation, medium=medium)
 
 
 def _ends_still(options: Options) -> bool:
@@ -256,12 +256,12 @@ def _averaged(found: Solution, images: ImagePlanes, problems: Problem, plan: Sol
     variances = None
     if problems.covariance is not None and not plan.channels:
         # In mm: the noise model of the images' own covariances compares lateral SDs with ranges'.
-        size = problems.spacing * found.place.parameters().scale
+        size = problems.spacing * found.iterate.parameters().scale
         variances = variance_planes(
             problems.covariance * (size[:, None, :, None] * size[:, None, None])
         )
     over = average_over_laws(
-        found.place,
+        found.iterate,
         found.observation,
         images,
         plan.laws,
@@ -277,7 +277,7 @@ def _averaged(found: Solution, images: ImagePlanes, problems: Problem, plan: Sol
         observation = OwnCovariances(over.sigma, shape, over.sigma[1] / over.sigma[0])
     return replace(
         found,
-        place=over.place,
+        iterate=over.iterate,
         observation=observation,
         covariance=over.covariance,
         elevation_sd=over.elevation_sd,

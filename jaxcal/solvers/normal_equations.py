@@ -20,9 +20,9 @@ An unknown y of the image itself is eliminated inside the pass: with D = phi_yy 
 Schur complement of this image is K = phi_qq - b b' / D (the shared unknowns' part of the
 arrow-shaped system that X, c and all offsets make together; its cost is O(n p^2)).
 
-The curvature is Gauss-Newton's where a lane's ``gate`` is 0, and exact where it is 1: far from the
-optimum the exact curvature may be indefinite, and near it Gauss-Newton is slow along directions
-that the data barely determine.
+The curvature is Gauss-Newton's for problems with ``exact`` 0; for those with 1 it includes the
+second derivatives of the residuals. Far from the optimum the exact curvature may be indefinite;
+near it Gauss-Newton is slow along directions that the data barely determine.
 
 Reference: Triggs, McLauchlan, Hartley, Fitzgibbon, "Bundle adjustment: a modern synthesis", 2000.
 """
@@ -45,8 +45,11 @@ from jaxcal.model.unrolled import Entry, Matrix, Vector
 IN_IMAGE = 3
 """Coordinates of q."""
 
+V_Y = 1
+"""Index of v_y, the unknown that moves every q_iy by -1."""
+
 ROTATION = (3, 4, 5)
-"""Places of w among the unknowns."""
+"""Indices of w among the unknowns."""
 
 
 @cache
@@ -84,29 +87,29 @@ class _Derived(eqx.Module):
     Attributes:
         unknowns: which unknowns the arguments after q are.
         components: the residuals.
-        slopes: for every component, the rows of first derivatives.
-        bends: for every component, the second derivatives by (row, i, j).
+        first: for every component, the rows of first derivatives.
+        second: for every component, the second derivatives by (row, i, j).
         free: 1 where the image's own unknown may move; None where there is none.
     """
 
     unknowns: tuple[int, ...]
     components: list[Component]
-    slopes: list[Matrix]
-    bends: list[dict[tuple[int, int, int], Entry]]
+    first: list[Matrix]
+    second: list[dict[tuple[int, int, int], Entry]]
     free: Array | None
 
 
 def _derive(
     observation: Observation,
     q: Vector,
-    turned: Matrix,
+    tracker_to_image: Matrix,
     iterate: Iterate,
     images: ImagePlanes,
     *,
     exact: bool,
 ) -> _Derived:
     """An observation's residuals at q, with their derivatives."""
-    still = jnp.zeros((images.lanes, 1), images.mask.dtype)
+    still = jnp.zeros((images.batch_size, 1), images.mask.dtype)
     unknowns = tuple(range(RIGID_UNKNOWNS, iterate.unknowns))
     further = [still] * len(unknowns)
     direct, free = further, None
@@ -114,17 +117,17 @@ def _derive(
         unknowns, direct = (*ROTATION, *unknowns), [still] * len(ROTATION) + further
     arguments = [*q, *direct]
     if isinstance(observation, LocalUnknown):
-        local, free = observation.local(q, Further.of(iterate, further, turned), images)
+        local, free = observation.local(q, Further.of(iterate, further, tracker_to_image), images)
         arguments.append(local)
 
     def evaluate(*at: Array) -> list[Component]:
         here, moved = list(at[:IN_IMAGE]), list(at[IN_IMAGE : IN_IMAGE + len(direct)])
-        axes = None
+        rotated = None
         if observation.oriented:
             # X turns by w, so directions in its frame turn back.
-            axes = unrolled.product(unrolled.rotation([-w for w in moved[:3]]), turned)
+            rotated = unrolled.product(unrolled.rotation([-w for w in moved[:3]]), tracker_to_image)
             moved = moved[3:]
-        beside = Further.of(iterate, moved, axes)
+        beside = Further.of(iterate, moved, rotated)
         if isinstance(observation, LocalUnknown):
             return observation.components_at(here, at[-1], beside, images)
         return observation.components(here, beside, images)
@@ -135,15 +138,15 @@ def _derive(
     components, traced = evaluate(*arguments), jax.make_jaxpr(errors)(*arguments)
     rows = derivatives.first(traced, arguments)
     bent = derivatives.second(traced, arguments) if exact else {}
-    slopes, bends, start = [], [], 0
+    first, second, start = [], [], 0
     for component in components:
         stop = start + len(component.errors)
-        slopes.append(rows[start:stop])
-        bends.append(
+        first.append(rows[start:stop])
+        second.append(
             {(row - start, *by): bend for (row, *by), bend in bent.items() if start <= row < stop}
         )
         start = stop
-    return _Derived(unknowns, components, slopes, bends, free)
+    return _Derived(unknowns, components, first, second, free)
 
 
 def over_elements(plane: Entry) -> Entry:
@@ -159,14 +162,14 @@ def weight_of(component: Component, images: ImagePlanes) -> Array:
     return mask if component.present is None else mask * component.present
 
 
-def _plain(derived: _Derived, k: int, images: ImagePlanes) -> Term:
+def _gauss_newton(derived: _Derived, k: int, images: ImagePlanes) -> Term:
     """Component k alone, unweighted, with Gauss-Newton's curvature."""
-    component, slopes = derived.components[k], derived.slopes[k]
-    width, weight = len(slopes[0]), weight_of(component, images)
+    component, first = derived.components[k], derived.first[k]
+    width, weight = len(first[0]), weight_of(component, images)
     cost: Entry = 0
     gradient: Vector = [0] * width
     curvature: Matrix = [[0] * width for _ in range(width)]
-    for error, slope in zip(component.errors, slopes, strict=True):
+    for error, slope in zip(component.errors, first, strict=True):
         pull = weight * error
         heavy = [unrolled.times(weight, entry) for entry in slope]
         cost = unrolled.add(cost, over_elements(pull * error))
@@ -180,12 +183,12 @@ def _plain(derived: _Derived, k: int, images: ImagePlanes) -> Term:
     return Term(cost, gradient, curvature)
 
 
-def _bent(derived: _Derived, k: int, images: ImagePlanes) -> Matrix:
+def _second_order(derived: _Derived, k: int, images: ImagePlanes) -> Matrix:
     """What second derivatives of component k's residuals add to its curvature."""
-    component, width = derived.components[k], len(derived.slopes[k][0])
+    component, width = derived.components[k], len(derived.first[k][0])
     weight = weight_of(component, images)
     found: Matrix = [[0] * width for _ in range(width)]
-    for (row, i, j), bend in derived.bends[k].items():
+    for (row, i, j), bend in derived.second[k].items():
         entry = over_elements(weight * component.errors[row] * bend)
         found[i][j] = unrolled.add(found[i][j], entry)
         found[j][i] = found[i][j]
@@ -207,7 +210,7 @@ def _summed(matrices: list[Matrix], weights: Vector) -> Matrix:
     return found
 
 
-def _weighed(terms: list[Term], weights: list[Array]) -> Term:
+def _weighted_sum(terms: list[Term], weights: list[Array]) -> Term:
     """The sum of terms times planes."""
     return Term(
         unrolled.dot(weights, [term.cost for term in terms]),
@@ -231,18 +234,22 @@ def _eliminated(term: Term, plain: Entry, free: Array) -> Term:
         free: 1 where it may move.
     """
     last = len(term.gradient) - 1
-    bend = jnp.where(term.curvature[last][last] > 0, term.curvature[last][last], plain)
-    give = jnp.where((free > 0) & (bend > 0), 1 / jnp.where(bend > 0, bend, 1.0), 0.0)
-    meets, slope = term.curvature[last][:last], term.gradient[last]
-    held = [unrolled.times(give, entry) for entry in meets]
+    # D and 1/D (0 where the unknown is not free), b = phi_qy, and b/D.
+    own = jnp.where(term.curvature[last][last] > 0, term.curvature[last][last], plain)
+    inverse = jnp.where((free > 0) & (own > 0), 1 / jnp.where(own > 0, own, 1.0), 0.0)
+    coupling, slope = term.curvature[last][:last], term.gradient[last]
+    scaled = [unrolled.times(inverse, entry) for entry in coupling]
 
     def less(entry: Entry, by: Entry, other: Entry) -> Entry:
         return unrolled.add(entry, unrolled.times(-1, unrolled.times(by, other)))
 
     return Term(
-        less(term.cost, give * slope, slope),
-        [less(term.gradient[i], held[i], slope) for i in range(last)],
-        [[less(term.curvature[i][j], held[i], meets[j]) for j in range(last)] for i in range(last)],
+        less(term.cost, inverse * slope, slope),
+        [less(term.gradient[i], scaled[i], slope) for i in range(last)],
+        [
+            [less(term.curvature[i][j], scaled[i], coupling[j]) for j in range(last)]
+            for i in range(last)
+        ],
     )
 
 
@@ -253,31 +260,33 @@ def _shared(term: Term) -> Term:
 
 def contributions(
     q: Vector,
-    turned: Matrix,
+    tracker_to_image: Matrix,
     term: Term,
     direct: tuple[int, ...],
-    gate: Float[Array, "lanes 1"] | int,
+    exact: Float[Array, "batch 1"] | int,
 ) -> tuple[Vector, Vector]:
     """An image's part of the curvature (upper triangle) and the gradient, as planes or 0.
 
     ``direct`` tells which unknowns the term's arguments after q are.
 
-    The gate is the factor on the second derivatives of q; 0 for none. They are included by using
-    A = [q]x' K + gate [g]x instead of [q]x' K: A M is then all of block (w, d), and A [q]x is block
-    (w, w) up to an antisymmetric part, which :func:`with_twist` takes from the summed gradient.
+    ``exact`` is the factor on the second derivatives of q; 0 for none. They are included by using
+    A = [q]x' K + exact [g]x instead of [q]x' K: A M is then all of block (w, d), and A [q]x is
+    block (w, w) up to an antisymmetric part, which :func:`with_twist` takes from the summed
+    gradient.
     """
     unknowns = RIGID_UNKNOWNS + sum(place >= RIGID_UNKNOWNS for place in direct)
     g = term.gradient[:IN_IMAGE]
     k = [row[:IN_IMAGE] for row in term.curvature[:IN_IMAGE]]
     lever = unrolled.cross(q)
-    across, forth = unrolled.product(k, lever), unrolled.product(k, turned)
-    inverse = unrolled.transpose(turned)
-    bent = unrolled.cross([unrolled.times(gate, value) for value in g])
+    # K [q]x and K M; A = [q]x' K + exact [g]x; A [q]x, A M and M' K M.
+    across, forth = unrolled.product(k, lever), unrolled.product(k, tracker_to_image)
+    inverse = unrolled.transpose(tracker_to_image)
+    bent = unrolled.cross([unrolled.times(exact, value) for value in g])
     back = [
         [unrolled.add(a, b) for a, b in zip(*rows, strict=True)]
         for rows in zip(unrolled.transpose(across), bent, strict=True)
     ]
-    about, mixed = unrolled.product(back, lever), unrolled.product(back, turned)
+    about, mixed = unrolled.product(back, lever), unrolled.product(back, tracker_to_image)
     point = unrolled.product(inverse, forth)
     full: Matrix = [[0] * unknowns for _ in range(unknowns)]
     for i in range(3):
@@ -296,7 +305,7 @@ def contributions(
         return found + unrolled.apply(inverse, values)
 
     gradient = in_rigid(g) + [0] * (unknowns - RIGID_UNKNOWNS)
-    # Of w's own part of the gradient there is no antisymmetric part to take out again.
+    # What depends on the unknowns directly, not through q.
     own: Vector = [0] * unknowns
     for a, place in enumerate(direct, IN_IMAGE):
         own[place] = term.gradient[a]
@@ -308,7 +317,8 @@ def contributions(
             full[row][col] = unrolled.add(full[row][col], twice)
         for b, other in enumerate(direct[a - IN_IMAGE :], a):
             full[place][other] = unrolled.add(full[place][other], term.curvature[a][b])
-    kept = unrolled.cross([unrolled.times(0.5, unrolled.times(gate, own[k])) for k in ROTATION])
+    # with_twist takes the skew part of the whole gradient by w; the direct part has none: add it.
+    kept = unrolled.cross([unrolled.times(0.5, unrolled.times(exact, own[k])) for k in ROTATION])
     for i, j in ((0, 1), (0, 2), (1, 2)):
         full[3 + i][3 + j] = unrolled.add(full[3 + i][3 + j], kept[i][j])
     return [full[i][j] for i, j in pairs(unknowns)], gradient
@@ -319,7 +329,7 @@ def with_twist(flat: Vector, gradient: Vector, unknowns: int) -> Vector:
 
     Args:
         flat: sums of :func:`contributions`.
-        gradient: v and w parts of the summed gradient, times the gate. The v part is -sum g, so
+        gradient: v and w parts of the summed gradient, times ``exact``. The v part is -sum g, so
             block (v, w) gets [sum g]x. The w part is sum g x q: the upper half of A [q]x has
             q_i g_j where block (w, w) needs the mean of q_i g_j and q_j g_i.
         unknowns: how many there are.
@@ -337,8 +347,8 @@ def with_twist(flat: Vector, gradient: Vector, unknowns: int) -> Vector:
     return flat
 
 
-class Normal(eqx.Module):
-    """The normal equations of every lane at an iterate, lanes last.
+class NormalEquations(eqx.Module):
+    """The normal equations of every problem at an iterate; batch axis last.
 
     Attributes:
         curvature: upper triangle, in the order of :func:`pairs`.
@@ -348,16 +358,16 @@ class Normal(eqx.Module):
             eliminating these lowers the diagonal; None where the diagonal is |J_k|^2.
     """
 
-    curvature: Float[Array, "triangle lanes"]
-    gradient: Float[Array, "p lanes"]
-    cost: Float[Array, " lanes"]
-    squares: Float[Array, "p lanes"] | None = None
+    curvature: Float[Array, "triangle batch"]
+    gradient: Float[Array, "p batch"]
+    cost: Float[Array, " batch"]
+    squares: Float[Array, "p batch"] | None = None
 
-    def stacked(self) -> Float[Array, "p p lanes"]:
+    def stacked(self) -> Float[Array, "p p batch"]:
         """The full matrix as one array."""
         return stacked(self.curvature)
 
-    def diagonal(self) -> Float[Array, "p lanes"]:
+    def diagonal(self) -> Float[Array, "p batch"]:
         """|J_k|^2 of every unknown: what damping and the gradient cosine are relative to."""
         if self.squares is not None:
             return self.squares
@@ -365,7 +375,7 @@ class Normal(eqx.Module):
         return picked(self.curvature, np.array(places))
 
 
-def stacked(flat: Float[Array, "triangle lanes"]) -> Float[Array, "p p lanes"]:
+def stacked(flat: Float[Array, "triangle batch"]) -> Float[Array, "p p batch"]:
     """A symmetric matrix from its upper triangle."""
     return picked(flat, square_places(int((2 * flat.shape[0]) ** 0.5)))
 
@@ -379,43 +389,48 @@ def accumulate(
     iterate: Iterate,
     observation: Observation,
     images: ImagePlanes,
-    gate: Float[Array, " lanes"] | None,
+    exact: Float[Array, " batch"] | None,
     medium: MediumPrior | None = None,
-) -> Normal:
+) -> NormalEquations:
     """One pass: the normal equations at an iterate.
 
     Args:
-        iterate: X, c and the further unknowns of every lane.
-        observation: whose residuals.
+        iterate: X, c and the further unknowns of every problem.
+        observation: the objective.
         images: the data.
-        gate: 1 for exact second derivatives, 0 for Gauss-Newton's; None for the latter everywhere.
-        medium: what is known of sound speed and delay beforehand.
+        exact: 1 for exact second derivatives, 0 for Gauss-Newton's curvature; None for the latter
+            everywhere.
+        medium: prior of sound speed and delay, or None.
+
+    Returns:
+        The normal equations of the step of X, c and the further unknowns; an image's own unknown is
+        eliminated.
     """
-    q, turned = targets(iterate, images)
-    wide = None if gate is None else gate[:, None]
-    derived = _derive(observation, q, turned, iterate, images, exact=gate is not None)
+    q, tracker_to_image = targets(iterate, images)
+    wide = None if exact is None else exact[:, None]
+    derived = _derive(observation, q, tracker_to_image, iterate, images, exact=exact is not None)
     weights = [(1 / (sd * sd))[:, None] for sd in observation.sigma]
     count = len(derived.components)
-    term = _weighed([_plain(derived, k, images) for k in range(count)], weights)
+    term = _weighted_sum([_gauss_newton(derived, k, images) for k in range(count)], weights)
     whole, own_bend = term, term.curvature[-1][-1]
     if wide is not None:
-        bent = [_bent(derived, k, images) for k in range(count)]
+        bent = [_second_order(derived, k, images) for k in range(count)]
         gated = [wide * weight for weight in weights]
         term = Term(term.cost, term.gradient, _summed([term.curvature, *bent], [1, *gated]))
     places = diagonal_places(iterate.unknowns)
     columns: Vector = []
     if derived.free is not None:
-        every, _ = contributions(q, turned, _shared(whole), derived.unknowns, 0)
+        every, _ = contributions(q, tracker_to_image, _shared(whole), derived.unknowns, 0)
         columns = [every[k] for k in places]
         term = _eliminated(term, own_bend, derived.free)
     curvature, gradient = contributions(
-        q, turned, term, derived.unknowns, 0 if wide is None else wide
+        q, tracker_to_image, term, derived.unknowns, 0 if wide is None else wide
     )
     cost, *sums = total([term.cost, *curvature, *gradient, *columns])
     flat, gradient = sums[: len(curvature)], sums[len(curvature) : len(curvature) + len(gradient)]
     squares = sums[len(curvature) + len(gradient) :]
-    if gate is not None:
-        twist = [gate * value for value in gradient[:6]]
+    if exact is not None:
+        twist = [exact * value for value in gradient[:6]]
         flat = with_twist(flat, twist, iterate.unknowns)
     if medium is not None:
         for k, away, precision in medium.deviations(iterate):
@@ -423,7 +438,7 @@ def accumulate(
             gradient[k] = gradient[k] + precision * away
             cost = cost + precision * away * away
     lengths = jnp.stack(squares) if squares else None
-    return Normal(unrolled.as_array(flat), unrolled.as_array(gradient), cost, lengths)
+    return NormalEquations(unrolled.as_array(flat), unrolled.as_array(gradient), cost, lengths)
 
 
 def information_and_design(
@@ -431,23 +446,25 @@ def information_and_design(
     observation: Observation,
     images: ImagePlanes,
     medium: MediumPrior | None = None,
-) -> tuple[Float[Array, "p p lanes"], Float[Array, "p p lanes"]]:
+) -> tuple[Float[Array, "p p batch"], Float[Array, "p p batch"]]:
     """Gauss-Newton's matrix, and that of the unweighted residuals, in one pass.
 
     Args:
-        iterate: X, c and the further unknowns of every lane.
+        iterate: X, c and the further unknowns of every problem.
         observation: one without an unknown in every image.
         images: the data.
-        medium: what is known of sound speed and delay beforehand.
+        medium: prior of sound speed and delay, or None.
     """
-    q, turned = targets(iterate, images)
-    derived = _derive(observation, q, turned, iterate, images, exact=False)
-    curvatures = [_plain(derived, k, images).curvature for k in range(len(derived.components))]
+    q, tracker_to_image = targets(iterate, images)
+    derived = _derive(observation, q, tracker_to_image, iterate, images, exact=False)
+    curvatures = [
+        _gauss_newton(derived, k, images).curvature for k in range(len(derived.components))
+    ]
     planes: Vector = []
     for weights in ([(1 / (sd * sd))[:, None] for sd in observation.sigma], [1] * len(curvatures)):
         curvature = _summed(curvatures, weights)
         term = Term(0, [0] * len(curvature), curvature)
-        planes += contributions(q, turned, term, derived.unknowns, 0)[0]
+        planes += contributions(q, tracker_to_image, term, derived.unknowns, 0)[0]
     sums = total(planes)
     flat, design = sums[: len(sums) // 2], sums[len(sums) // 2 :]
     if medium is not None:
@@ -458,68 +475,69 @@ def information_and_design(
 
 
 class ComponentSums(eqx.Module):
-    """Sums of one pass over the images for each component separately, unweighted; lanes last.
+    """Sums of one pass over the images for each component separately, unweighted; batch axis last.
 
     Attributes:
         squares: rss_k, mm^2.
         gradient: g_k.
         matrix: N_k, Gauss-Newton's, upper triangles.
-        rest: exact curvature with the given SDs less sum N_k / s_k^2; zeros without SDs.
-        known: what is known of the medium: cost, gradient, diagonal of the curvature.
+        rest: C, the exact curvature with the given SDs less sum N_k / s_k^2; zeros without SDs.
+        prior: what the prior of sound speed and delay adds to cost, gradient and diagonal of the
+            curvature.
     """
 
-    squares: Float[Array, "k lanes"]
-    gradient: Float[Array, "k p lanes"]
-    matrix: Float[Array, "k triangle lanes"]
-    rest: Float[Array, "triangle lanes"]
-    known: tuple[Float[Array, " lanes"], Float[Array, "p lanes"], Float[Array, "p lanes"]] | None
+    squares: Float[Array, "k batch"]
+    gradient: Float[Array, "k p batch"]
+    matrix: Float[Array, "k triangle batch"]
+    rest: Float[Array, "triangle batch"]
+    prior: tuple[Float[Array, " batch"], Float[Array, "p batch"], Float[Array, "p batch"]] | None
 
-    def weighed(self, weight: Float[Array, "k lanes"]) -> Normal:
+    def weighted(self, weight: Float[Array, "k batch"]) -> NormalEquations:
         """Gauss-Newton's normal equations with weights 1/s_k^2."""
         flat = jnp.sum(weight[:, None] * self.matrix, axis=0)
         gradient = jnp.sum(weight[:, None] * self.gradient, axis=0)
         cost = jnp.sum(weight * self.squares, axis=0)
-        if self.known is not None:
-            away, slope, diagonal = self.known
+        if self.prior is not None:
+            away, slope, diagonal = self.prior
             rows, places = unrolled.rows_of(flat), diagonal_places(slope.shape[0])
             for place, entry in zip(places, diagonal, strict=True):
                 rows[place] = rows[place] + entry
             flat, gradient, cost = jnp.stack(rows), gradient + slope, cost + away
-        return Normal(flat, gradient, cost)
+        return NormalEquations(flat, gradient, cost)
 
 
 def component_sums(
     iterate: Iterate,
     observation: Observation,
     images: ImagePlanes,
-    sigma: Float[Array, "k lanes"] | None,
+    sigma: Float[Array, "k batch"] | None,
     medium: MediumPrior | None = None,
 ) -> ComponentSums:
     """One pass that keeps the components apart.
 
     Args:
-        iterate: X, c and the further unknowns of every lane.
+        iterate: X, c and the further unknowns of every problem.
         observation: one without an unknown in every image.
         images: the data.
         sigma: SDs for the rest of the exact curvature, mm; None leaves it out.
-        medium: what is known of sound speed and delay beforehand.
+        medium: prior of sound speed and delay, or None.
     """
-    q, turned = targets(iterate, images)
-    derived = _derive(observation, q, turned, iterate, images, exact=sigma is not None)
+    q, tracker_to_image = targets(iterate, images)
+    derived = _derive(observation, q, tracker_to_image, iterate, images, exact=sigma is not None)
     count, unknowns = len(derived.components), iterate.unknowns
-    terms = [_plain(derived, k, images) for k in range(count)]
+    terms = [_gauss_newton(derived, k, images) for k in range(count)]
     planes: Vector = [term.cost for term in terms]
     each = unknowns + len(pairs(unknowns))
     for term in terms:
-        matrix, gradient = contributions(q, turned, term, derived.unknowns, 0)
+        matrix, gradient = contributions(q, tracker_to_image, term, derived.unknowns, 0)
         planes += [*gradient, *matrix]
     if sigma is not None:
         weights = [(1 / (sd * sd))[:, None] for sd in sigma]
-        weighed = _weighed(terms, weights)
-        bent = _summed([_bent(derived, k, images) for k in range(count)], weights)
+        weighted = _weighted_sum(terms, weights)
+        bent = _summed([_second_order(derived, k, images) for k in range(count)], weights)
         # The second derivatives of q itself follow from the weighted gradient.
-        term = Term(0, weighed.gradient, bent)
-        planes += contributions(q, turned, term, derived.unknowns, 1)[0]
+        term = Term(0, weighted.gradient, bent)
+        planes += contributions(q, tracker_to_image, term, derived.unknowns, 1)[0]
     sums = total(planes)
     squares, sums = sums[:count], sums[count:]
     parts = [sums[k * each : (k + 1) * each] for k in range(count)]

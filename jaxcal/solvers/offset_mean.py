@@ -55,7 +55,7 @@ PROBABILITY = 0.1
 LAGS = 5
 """Errors are taken to be correlated up to this many images apart, in their given order."""
 
-FELT = tuple(1 - lag / (LAGS + 1) for lag in range(LAGS + 1))
+BARTLETT = tuple(1 - lag / (LAGS + 1) for lag in range(LAGS + 1))
 """Bartlett's weights of these lags, from 0 on."""
 
 LEAST_LEFT = 0.05
@@ -71,17 +71,17 @@ class MeanBelief(eqx.Module):
         log_odds: ln of how much more probable the data are with a mean than without one.
     """
 
-    mean: Float[Array, "*lanes"]
-    variance: Float[Array, "*lanes"]
-    log_odds: Float[Array, "*lanes"]
+    mean: Float[Array, "*batch"]
+    variance: Float[Array, "*batch"]
+    log_odds: Float[Array, "*batch"]
 
     @property
-    def probability(self) -> Float[Array, "*lanes"]:
+    def probability(self) -> Float[Array, "*batch"]:
         """Probability that there is a mean other than zero."""
         return jax.nn.sigmoid(self.log_odds + log(PROBABILITY / (1 - PROBABILITY)))
 
 
-def believed(mean: Array, variance: Array, offset_sd: Array, trust: Array) -> MeanBelief:
+def mean_belief(mean: Array, variance: Array, offset_sd: Array, trust: Array) -> MeanBelief:
     """The belief about b, from the Gaussian belief that assumes that there is a mean.
 
     Args:
@@ -102,25 +102,25 @@ def believed(mean: Array, variance: Array, offset_sd: Array, trust: Array) -> Me
     return MeanBelief(p * belief.mean, spread, log_odds)
 
 
-def gained(belief: MeanBelief) -> Array:
+def log_evidence_gain(belief: MeanBelief) -> Array:
     """Ln of the evidence over that under the assumption that there is a mean."""
     return jnp.logaddexp(log(PROBABILITY), log(1 - PROBABILITY) - belief.log_odds)
 
 
 def influences(
-    place: Iterate,
+    iterate: Iterate,
     observation: Observation,
     images: ImagePlanes,
-    weight: Float[Array, "k lanes"],
-    mean: Float[Array, " lanes"],
+    weight: Float[Array, "k batch"],
+    mean: Float[Array, " batch"],
     *,
-    along: Float[Array, "q lanes"],
-    step: Float[Array, "q lanes"],
-) -> tuple[Float[Array, "lanes n"], Float[Array, "lanes n"]]:
+    along: Float[Array, "q batch"],
+    step: Float[Array, "q batch"],
+) -> tuple[Float[Array, "batch n"], Float[Array, "batch n"]]:
     """How far each image moves b, to first order, mm, and its share of the information about b.
 
     Args:
-        place: X, c and the further unknowns.
+        iterate: X, c and the further unknowns.
         observation: whose residuals; the offsets are the last.
         images: the data.
         weight: 1/s_k^2.
@@ -128,27 +128,27 @@ def influences(
         along: b's row of the inverse of the normal matrix, b last.
         step: to the minimum, b last.
     """
-    q, turned = targets(place, images)
+    q, tracker_to_image = targets(iterate, images)
 
-    def moved(by: Float[Array, "q lanes"]) -> Vector:
+    def moved(by: Float[Array, "q batch"]) -> Vector:
         rows = [row[:, None] for row in by]
         turn = unrolled.apply(unrolled.cross(q), rows[3:6])
-        shift = unrolled.apply(turned, rows[6:RIGID_UNKNOWNS])
+        shift = unrolled.apply(tracker_to_image, rows[6:RIGID_UNKNOWNS])
         rigid = [unrolled.add(-v, w, d) for v, w, d in zip(rows[:3], turn, shift, strict=True)]
         return [*rigid, *rows[RIGID_UNKNOWNS:-1]]
 
     def residuals(*at: Array) -> list[Vector]:
-        beside = Further.of(place, list(at[len(q) :]))
+        beside = Further.of(iterate, list(at[len(q) :]))
         return [each.errors for each in observation.components(list(at[: len(q)]), beside, images)]
 
     still = jnp.zeros_like(mean)[:, None]
-    here = [*q, *([still] * (place.unknowns - RIGID_UNKNOWNS))]
+    here = [*q, *([still] * (iterate.unknowns - RIGID_UNKNOWNS))]
     values, to_minimum = jax.jvp(residuals, tuple(here), tuple(moved(step)))
     _, slopes = jax.jvp(residuals, tuple(here), tuple(moved(along)))
     values[-1] = [values[-1][0] - mean[:, None]]
     to_minimum[-1] = [to_minimum[-1][0] - step[-1][:, None]]
     slopes[-1] = [slopes[-1][0] - along[-1][:, None]]
-    parts = observation.components(q, Further.of(place, here[len(q) :]), images)
+    parts = observation.components(q, Further.of(iterate, here[len(q) :]), images)
     total = share = jnp.zeros_like(images.mask)
 
     for k, part in enumerate(parts):
@@ -160,10 +160,10 @@ def influences(
 
 
 def trust_in(
-    variance: Float[Array, " lanes"],
-    moved: Float[Array, "lanes n"],
-    share: Float[Array, "lanes n"],
-) -> Float[Array, " lanes"]:
+    variance: Float[Array, " batch"],
+    moved: Float[Array, "batch n"],
+    share: Float[Array, "batch n"],
+) -> Float[Array, " batch"]:
     """The variance of b under the model over the variance that the images show, at most one.
 
     Args:
@@ -182,12 +182,12 @@ def trust_in(
     # Loops, since what goes into a loop is computed before it. Otherwise XLA would compute an
     # image's influence again for each of its neighbours.
     def add_neighbours(lag: Array, near: Array) -> Array:
-        return near + felt[lag] * (shifted(shares, lag) + shifted(shares, -lag))
+        return near + weights[lag] * (shifted(shares, lag) + shifted(shares, -lag))
 
     def add_products(lag: Array, shown: Array) -> Array:
-        return shown + 2 * felt[lag] * jnp.sum(moved * shifted(moves, lag), axis=1)
+        return shown + 2 * weights[lag] * jnp.sum(moved * shifted(moves, lag), axis=1)
 
-    felt, shares = jnp.asarray(FELT, share.dtype), around(share)
+    weights, shares = jnp.asarray(BARTLETT, share.dtype), around(share)
     near = jax.lax.fori_loop(1, LAGS + 1, add_neighbours, share)
     moved = moved / jnp.maximum(1 - near, LEAST_LEFT)
     moves = around(moved)

@@ -19,9 +19,9 @@ derivatives add to the curvature:
 
 so the SDs are updated a few times from these sums alone, the step for the new SDs is taken, and the
 next pass computes the exact sums there. Steps are accepted by the decrease of the weighted cost
-with the new SDs, and damped as in :mod:`jaxcal.solvers.levenberg_marquardt`. A lane has converged
-when, at the same place, the update no longer changes the SDs and the gradient no longer moves the
-unknowns: the fixed point of Helmert's iteration.
+with the new SDs, and damped as in :mod:`jaxcal.solvers.levenberg_marquardt`. A problem has
+converged when, at the same iterate, the update no longer changes the SDs and the gradient no longer
+moves the unknowns: the fixed point of Helmert's iteration.
 
 A component whose error truly vanishes (no noise, or every target in the plane) would drive its SD
 to zero and the weights to infinity. The SD is held at a thousandth of the largest one, which is as
@@ -43,10 +43,10 @@ from jaxcal.model.observations import MediumPrior, Observation
 from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
 from jaxcal.solvers import dense
 from jaxcal.solvers.levenberg_marquardt import (
-    IDLE,
+    DAMPING_INCREASE,
     LARGEST_DAMPING,
     LEAST_DAMPING,
-    MORE,
+    MOST_STALLED,
     Judged,
     Rounding,
     damped_step,
@@ -54,12 +54,12 @@ from jaxcal.solvers.levenberg_marquardt import (
     empty_trace,
     gradient_cosine,
     judge_step,
-    reach,
+    largest_coordinate,
     recorded,
 )
 from jaxcal.solvers.normal_equations import (
     ComponentSums,
-    Normal,
+    NormalEquations,
     component_sums,
     pairs,
     stacked,
@@ -94,8 +94,8 @@ def on_floor(sigma: Float[Array, " components ..."]) -> Bool[Array, " components
 
 
 def helmert(
-    squares: Array, leverage: Array, count: Array, sigma: Float[Array, "k lanes"]
-) -> Float[Array, "k lanes"]:
+    squares: Array, leverage: Array, count: Array, sigma: Float[Array, "k batch"]
+) -> Float[Array, "k batch"]:
     """One update of the SDs, mm, without floor.
 
     Args:
@@ -109,60 +109,61 @@ def helmert(
 
 
 class SelfTuned(eqx.Module):
-    """The state of every lane; at the end, its answer.
+    """The state of every problem; at the end, its answer.
 
     Attributes:
-        place: X, c and the further unknowns.
+        iterate: X, c and the further unknowns.
         sigma: the SDs, mm.
-        updated: the SDs after one more update at ``place``.
+        updated: the SDs after one more update at ``iterate``, mm.
         cost: sum of squared (weighted) residuals.
-        change: largest relative change of the SDs by that update.
+        change: largest relative change of the SDs by that update (its logarithm).
         cosine: gradient cosine.
-        candidate: the place to look at next.
-        proposed: the SDs at ``candidate``.
-        units: the SDs that set the units of the residuals in the last pass.
-        retry: ``candidate`` is ``place`` again, with more damping.
-        weighed: the SDs for which the step to the candidate was computed.
-        half: half the cost before that step, with ``weighed``.
-        predicted: predicted decrease of ``half`` by that step.
+        candidate: the unknowns to evaluate next.
+        proposed: the SDs at ``candidate``, mm.
+        units: the SDs with which the residuals were formed in the last pass, mm.
+        retry: ``candidate`` is ``iterate`` again, with more damping.
+        step_sigma: the SDs for which the step to the candidate was computed, mm.
+        half_cost: half the cost before that step, with ``step_sigma``.
+        predicted: predicted decrease of ``half_cost`` by that step.
         exact_used: 1 where the step came from exact second derivatives.
         damping: Marquardt's lambda.
-        idle: steps in a row without a gain.
+        stalled: number of successive steps without a gain above rounding.
         iterations: passes.
-        settled: converged, as far as rounding allows.
-        active: the lane goes on.
+        converged: the SDs met their tolerance, and the gradient cosine met its own or steps gain
+            nothing above rounding.
+        active: the problem is not finished.
         trace: best cost after each of the first passes; NaN beyond the last; None: not kept.
     """
 
-    place: Iterate
-    sigma: Float[Array, "k lanes"]
-    updated: Float[Array, "k lanes"]
-    cost: Float[Array, " lanes"]
-    change: Float[Array, " lanes"]
-    cosine: Float[Array, " lanes"]
+    iterate: Iterate
+    sigma: Float[Array, "k batch"]
+    updated: Float[Array, "k batch"]
+    cost: Float[Array, " batch"]
+    change: Float[Array, " batch"]
+    cosine: Float[Array, " batch"]
     candidate: Iterate
-    proposed: Float[Array, "k lanes"]
-    units: Float[Array, "k lanes"]
-    retry: Bool[Array, " lanes"]
-    weighed: Float[Array, "k lanes"]
-    half: Float[Array, " lanes"]
-    predicted: Float[Array, " lanes"]
-    exact_used: Float[Array, " lanes"]
-    damping: Float[Array, " lanes"]
-    idle: Int[Array, " lanes"]
-    iterations: Int[Array, " lanes"]
-    settled: Bool[Array, " lanes"]
-    active: Bool[Array, " lanes"]
-    trace: Float[Array, "trace lanes"] | None
+    proposed: Float[Array, "k batch"]
+    units: Float[Array, "k batch"]
+    retry: Bool[Array, " batch"]
+    step_sigma: Float[Array, "k batch"]
+    half_cost: Float[Array, " batch"]
+    predicted: Float[Array, " batch"]
+    exact_used: Float[Array, " batch"]
+    damping: Float[Array, " batch"]
+    stalled: Int[Array, " batch"]
+    iterations: Int[Array, " batch"]
+    converged: Bool[Array, " batch"]
+    active: Bool[Array, " batch"]
+    trace: Float[Array, "trace batch"] | None
 
     @classmethod
-    def before(cls, start: Iterate, held: Float[Array, "k lanes"], trace: int) -> SelfTuned:
+    def before(cls, start: Iterate, fallback: Float[Array, "k batch"], trace: int) -> SelfTuned:
         """The state before the first pass; infinite SDs leave out exact second derivatives."""
         number = jnp.zeros_like(start.point[0])
         no, count = jnp.zeros(number.shape, bool), jnp.zeros(number.shape, jnp.int32)
-        sigma = jnp.zeros_like(held) + jnp.inf
+        sigma = jnp.zeros_like(fallback) + jnp.inf
         return cls(
-            place=start,
+            iterate=start,
             sigma=sigma,
             updated=sigma,
             cost=number,
@@ -172,50 +173,50 @@ class SelfTuned(eqx.Module):
             proposed=sigma,
             units=sigma,
             retry=~no,
-            weighed=sigma,
-            half=number,
+            step_sigma=sigma,
+            half_cost=number,
             predicted=number,
             exact_used=number,
             damping=number + 1e-6,
-            idle=count,
+            stalled=count,
             iterations=count,
-            settled=no,
+            converged=no,
             active=~no,
             trace=empty_trace(trace, number),
         )
 
 
 class Proposal(eqx.Module):
-    """What is to be tried next, from the sums at one place.
+    """The next candidate, from the sums at the iterate.
 
     Attributes:
         move: the step.
         sigma: the SDs after it, mm.
-        weighed: the SDs for which the step was computed, mm.
-        first: the SDs after one update at the place itself, mm.
+        step_sigma: the SDs for which the step was computed, mm.
+        updated: the SDs after one update at the iterate, mm.
         exact: 1 where exact second derivatives were used.
-        indefinite: no step: the matrix was indefinite.
-        half: half the cost at the place, with ``weighed``.
-        predicted: predicted decrease of ``half``.
+        indefinite: the matrix was indefinite, and the step is zero.
+        half_cost: half the cost at the iterate, with ``step_sigma``.
+        predicted: predicted decrease of ``half_cost``.
     """
 
-    move: Float[Array, "p lanes"]
-    sigma: Float[Array, "k lanes"]
-    weighed: Float[Array, "k lanes"]
-    first: Float[Array, "k lanes"]
-    exact: Float[Array, " lanes"]
-    indefinite: Bool[Array, " lanes"]
-    half: Float[Array, " lanes"]
-    predicted: Float[Array, " lanes"]
+    move: Float[Array, "p batch"]
+    sigma: Float[Array, "k batch"]
+    step_sigma: Float[Array, "k batch"]
+    updated: Float[Array, "k batch"]
+    exact: Float[Array, " batch"]
+    indefinite: Bool[Array, " batch"]
+    half_cost: Float[Array, " batch"]
+    predicted: Float[Array, " batch"]
 
 
 def updated(
     sums: ComponentSums,
-    normal: Normal,
-    sigma: Float[Array, "k lanes"],
-    move: Float[Array, "p lanes"],
-    count: Float[Array, "k lanes"],
-) -> Float[Array, "k lanes"]:
+    normal: NormalEquations,
+    sigma: Float[Array, "k batch"],
+    move: Float[Array, "p batch"],
+    count: Float[Array, "k batch"],
+) -> Float[Array, "k batch"]:
     """Helmert's update after a step.
 
     Args:
@@ -228,11 +229,11 @@ def updated(
     diagonal = normal.diagonal()
     ridge = 16 * jnp.finfo(count.dtype).eps * jnp.where(diagonal > 0, diagonal, 1.0)
     eye = jnp.eye(len(diagonal), dtype=diagonal.dtype)[..., None]
-    inverse, _ = dense.inverse_lanes_last(stacked(normal.curvature) + eye * ridge)
+    inverse, _ = dense.inverse_batch_last(stacked(normal.curvature) + eye * ridge)
     places = pairs(len(diagonal))
     twice = np.array([1 if i == j else 2 for i, j in places], diagonal.dtype)[:, None]
 
-    def flat(matrix: Float[Array, "p p lanes"]) -> Float[Array, "triangle lanes"]:
+    def flat(matrix: Float[Array, "p p batch"]) -> Float[Array, "triangle batch"]:
         rows, columns = (np.array(each) for each in zip(*places, strict=True))
         return barrier(twice * matrix[rows, columns])
 
@@ -243,86 +244,86 @@ def updated(
 
 
 class Tuning(eqx.Module):
-    """What every pass over a batch has in common.
+    """What all passes over a batch have in common.
 
     Attributes:
         observation: the objective.
         images: the data.
-        medium: what is known of sound speed and delay beforehand, or None.
-        held: the SDs of lanes with too few images to estimate them, mm.
+        medium: prior of sound speed and delay, or None.
+        fallback: the SDs of problems with too few images to estimate them, mm.
         count: numbers of residuals.
-        enough: lanes with enough images.
+        enough: problems with enough images to estimate SDs.
         coordinates: size of the coordinates that rounding acts on, mm.
-        standing: gradient cosine at which the unknowns stand still.
-        tolerance: relative change at which the SDs stand still.
+        cosine_tolerance: gradient cosine below which the unknowns have converged.
+        sigma_tolerance: relative change of an update below which the SDs have converged.
         max_rounds: most passes.
     """
 
     observation: Observation
     images: ImagePlanes
     medium: MediumPrior | None
-    held: Float[Array, "k lanes"]
-    count: Float[Array, "k lanes"]
-    enough: Bool[Array, " lanes"]
-    coordinates: Float[Array, " lanes"]
-    standing: float = eqx.field(static=True)
-    tolerance: float = eqx.field(static=True)
+    fallback: Float[Array, "k batch"]
+    count: Float[Array, "k batch"]
+    enough: Bool[Array, " batch"]
+    coordinates: Float[Array, " batch"]
+    cosine_tolerance: float = eqx.field(static=True)
+    sigma_tolerance: float = eqx.field(static=True)
     max_rounds: int = eqx.field(static=True)
 
     def update(
         self, sums: ComponentSums, sigma: Array, damping: Array, exact: Array
     ) -> tuple[Array, Array, Array, Array]:
-        """The step for given SDs, its predicted decrease, the SDs after it, and where it is lost.
+        """The step for given SDs, its predicted decrease, the SDs after it; where there is no step.
 
-        It is lost, and zero, where the matrix is indefinite.
+        The step is zero where the matrix is indefinite.
         """
-        normal = sums.weighed(1 / sigma**2)
-        curved = Normal(
+        normal = sums.weighted(1 / sigma**2)
+        curved = NormalEquations(
             normal.curvature + exact * sums.rest, normal.gradient, normal.cost, normal.diagonal()
         )
-        move, predicted, lost = damped_step(curved, damping)
+        move, predicted, indefinite = damped_step(curved, damping)
         after = barrier(updated(sums, normal, sigma, move, self.count))
         tuned = jnp.where(jnp.isfinite(after), after, sigma)
-        return move, predicted, jnp.where(self.enough, tuned, self.held), lost
+        return move, predicted, jnp.where(self.enough, tuned, self.fallback), indefinite
 
     def propose(self, sums: ComponentSums, sigma: Array, damping: Array, exact: Array) -> Proposal:
-        """From the sums at a place, a few updates of the SDs and the step for the new SDs."""
+        """From the sums at an iterate, a few updates of the SDs and the step for the new SDs."""
 
         def again(carry: tuple) -> tuple:
             count, sigma, _, _, _, first, exact, _ = carry
-            move, predicted, after, lost = self.update(sums, sigma, damping, exact)
+            move, predicted, after, indefinite = self.update(sums, sigma, damping, exact)
             first = jnp.where(count == 0, after, first)
-            exact = jnp.where(lost, 0.0, exact)
-            return count + 1, after, sigma, move, predicted, first, exact, lost
+            exact = jnp.where(indefinite, 0.0, exact)
+            return count + 1, after, sigma, move, predicted, first, exact, indefinite
 
         none = jnp.zeros_like(sums.gradient[0])
         zero = jnp.zeros((), jnp.int32)
         carry = (zero, sigma, sigma, none, none[0], sigma, exact, exact > 1)
         carry = jax.lax.while_loop(lambda carry: carry[0] < UPDATES, again, carry)
-        _, after, weighed, move, predicted, first, exact, lost = carry
+        _, after, step_sigma, move, predicted, first, exact, indefinite = carry
         return Proposal(
             move=move,
             sigma=after,
-            weighed=weighed,
-            first=first,
+            step_sigma=step_sigma,
+            updated=first,
             exact=exact,
-            indefinite=lost,
-            half=0.5 * sums.weighed(1 / weighed**2).cost,
+            indefinite=indefinite,
+            half_cost=0.5 * sums.weighted(1 / step_sigma**2).cost,
             predicted=predicted,
         )
 
     def judge(self, state: SelfTuned, sums: ComponentSums, rounding: Rounding) -> Judged:
         """Whether the step to the candidate is accepted."""
         # New SDs may change the units of the residuals, and so the cost, without any step.
-        whitened = sums.squares / state.weighed**2
+        whitened = sums.squares / state.step_sigma**2
         growth = self.observation.growth(state.units, state.proposed, whitened)
         return judge_step(
-            state.half - 0.5 * sums.weighed(1 / state.weighed**2).cost,
+            state.half_cost - 0.5 * sums.weighted(1 / state.step_sigma**2).cost,
             state.predicted,
-            state.half,
+            state.half_cost,
             rounding.residual,
             state.damping,
-            state.idle,
+            state.stalled,
             exact=state.exact_used > 0,
             retry=state.retry,
             allowance=growth,
@@ -335,23 +336,23 @@ class Tuning(eqx.Module):
             component_sums(state.candidate, observed, self.images, state.proposed, self.medium)
         )
         crude = with_floor(jnp.sqrt(sums.squares / self.count))
-        crude = jnp.where(self.enough, crude, self.held)
+        crude = jnp.where(self.enough, crude, self.fallback)
         proposed = jnp.where(state.iterations == 0, crude, state.proposed)
-        normal = sums.weighed(1 / proposed**2)
+        normal = sums.weighted(1 / proposed**2)
         rounding = Rounding.at(self.coordinates, 1 / jnp.min(proposed, axis=0), self.images)
         cosine = gradient_cosine(normal, rounding.vanished)
         judged = self.judge(state, sums, rounding)
-        place, sigma, cost, cosine = barrier(
+        iterate, sigma, cost, cosine = barrier(
             choose(
                 judged.accept & state.active,
                 (state.candidate, proposed, normal.cost, cosine),
-                (state.place, state.sigma, state.cost, state.cosine),
+                (state.iterate, state.sigma, state.cost, state.cosine),
             )
         )
         # Where the candidate is refused, the proposal from its sums is not used.
         exact = jnp.where(cosine <= EXACT_BELOW, 1.0, 0.0).astype(self.coordinates.dtype)
         found = self.propose(sums, sigma, judged.damping, exact)
-        new = self.next_state(state, judged, found, place, sigma, cost, cosine)
+        new = self.next_state(state, judged, found, iterate, sigma, cost, cosine)
         return choose(state.active, new, state)
 
     def next_state(
@@ -359,43 +360,43 @@ class Tuning(eqx.Module):
         state: SelfTuned,
         judged: Judged,
         found: Proposal,
-        place: Iterate,
-        sigma: Float[Array, "k lanes"],
-        cost: Float[Array, " lanes"],
-        cosine: Float[Array, " lanes"],
+        iterate: Iterate,
+        sigma: Float[Array, "k batch"],
+        cost: Float[Array, " batch"],
+        cosine: Float[Array, " batch"],
     ) -> SelfTuned:
-        """The state after a pass, with the best place so far and what was proposed from there."""
-        accept, damping, idle = judged.accept, judged.damping, judged.idle
-        change = jnp.max(jnp.abs(jnp.log(found.first / sigma)), axis=0)
+        """The state after a pass, with the best iterate so far and what was proposed from there."""
+        accept, damping, stalled = judged.accept, judged.damping, judged.stalled
+        change = jnp.max(jnp.abs(jnp.log(found.updated / sigma)), axis=0)
         change = jnp.where(accept, change, state.change)
-        there = (cosine <= self.standing) | (idle >= IDLE)
-        done = there & (change <= self.tolerance) & accept
-        more = jnp.maximum(MORE * damping, LEAST_DAMPING)
+        there = (cosine <= self.cosine_tolerance) | (stalled >= MOST_STALLED)
+        done = there & (change <= self.sigma_tolerance) & accept
+        more = jnp.maximum(DAMPING_INCREASE * damping, LEAST_DAMPING)
         damping = jnp.where(found.indefinite & accept, more, damping)
         iterations = state.iterations + 1
-        over = (damping > LARGEST_DAMPING) | (iterations >= self.max_rounds)
-        over = over | jnp.logical_not(jnp.isfinite(cost))
+        given_up = (damping > LARGEST_DAMPING) | (iterations >= self.max_rounds)
+        given_up = given_up | jnp.logical_not(jnp.isfinite(cost))
         retry = found.indefinite | jnp.logical_not(accept)
         return SelfTuned(
-            place=place,
+            iterate=iterate,
             sigma=sigma,
-            updated=jnp.where(accept, found.first, state.updated),
+            updated=jnp.where(accept, found.updated, state.updated),
             cost=cost,
             change=change,
             cosine=cosine,
-            candidate=choose(retry, place, place.moved(barrier(found.move))),
+            candidate=choose(retry, iterate, iterate.moved(barrier(found.move))),
             proposed=jnp.where(retry, sigma, found.sigma),
             units=state.proposed,
             retry=retry,
-            weighed=found.weighed,
-            half=found.half,
+            step_sigma=found.step_sigma,
+            half_cost=found.half_cost,
             predicted=found.predicted,
             exact_used=found.exact,
             damping=damping,
-            idle=idle,
+            stalled=stalled,
             iterations=iterations,
-            settled=done,
-            active=jnp.logical_not(done | over),
+            converged=done,
+            active=jnp.logical_not(done | given_up),
             trace=recorded(state.trace, state.iterations, cost),
         )
 
@@ -409,38 +410,40 @@ def self_tuned(
     max_rounds: int = 100,
     trace: int = 0,
 ) -> SelfTuned:
-    """Solve every lane, its SDs estimated by REML.
+    """Solve every problem, its SDs estimated by REML.
 
     It stops at a gradient cosine of 1e-10 and a relative change of the SDs of 1e-9 in float64, and
     at 1e-4 for both in float32.
 
     Args:
         start: a conventional fit.
-        observation: the objective; lanes with fewer than 8 used images keep its SDs.
+        observation: the objective; problems with fewer than 8 used images keep its SDs.
         images: the data.
-        medium: what is known of sound speed and delay beforehand.
+        medium: prior of sound speed and delay, or None.
         max_rounds: most passes.
         trace: how many values of the objective to keep.
     """
-    held, count = observation.sigma, observation.count(images)
+    fallback, count = observation.sigma, observation.count(images)
     enough = images.used >= MINIMUM_SELF_TUNING
-    standing = default_tolerance(images.mask.dtype)
+    cosine_tolerance = default_tolerance(images.mask.dtype)
     images, observation = barrier((images.padded(), observation.padded()))
-    # Values of a lane are computed once, and not again for every image.
-    coordinates, held, count, enough = barrier((reach(start, images), held, count, enough))
+    # Values of a problem are computed once, and not again for every image.
+    coordinates, fallback, count, enough = barrier(
+        (largest_coordinate(start, images), fallback, count, enough)
+    )
     tuning = Tuning(
         observation=observation,
         images=images,
         medium=medium,
-        held=held,
+        fallback=fallback,
         count=count,
         enough=enough,
         coordinates=coordinates,
-        standing=standing,
-        tolerance=10 * standing if standing < 1e-9 else standing,
+        cosine_tolerance=cosine_tolerance,
+        sigma_tolerance=10 * cosine_tolerance if cosine_tolerance < 1e-9 else cosine_tolerance,
         max_rounds=max_rounds,
     )
-    begun = SelfTuned.before(barrier(start), held, trace)
+    begun = SelfTuned.before(barrier(start), fallback, trace)
 
     # Not the bound method itself: JAX hashes what it loops over, and arrays have no hash.
     return jax.lax.while_loop(
@@ -449,20 +452,20 @@ def self_tuned(
 
 
 def update_at(
-    place: Iterate,
-    sigma: Float[Array, "k lanes"],
+    iterate: Iterate,
+    sigma: Float[Array, "k batch"],
     observation: Observation,
     images: ImagePlanes,
     medium: MediumPrior | None,
-) -> tuple[Normal, Float[Array, "k lanes"]]:
-    """The normal equations with SDs, and the SDs after one update, at a place.
+) -> tuple[NormalEquations, Float[Array, "k batch"]]:
+    """The normal equations with SDs, and the SDs after one update, at an iterate.
 
     Where :func:`self_tuned` stops, the gradient is zero and the update leaves the SDs as they are;
     :mod:`jaxcal.solvers.implicit` differentiates these two conditions.
     """
     observed = observation.with_sigma(sigma)
-    sums = component_sums(place, observed, images, None, medium)
-    normal = sums.weighed(1 / sigma**2)
+    sums = component_sums(iterate, observed, images, None, medium)
+    normal = sums.weighted(1 / sigma**2)
     still = jnp.zeros_like(normal.gradient)
     after = updated(sums, normal, sigma, still, observation.count(images))
     enough = images.used >= MINIMUM_SELF_TUNING

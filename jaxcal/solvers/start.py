@@ -38,7 +38,7 @@ from jaxcal.model import unrolled
 from jaxcal.model.batch import ImagePlanes, Iterate, barrier, choose, total
 from jaxcal.model.observations import InPlane
 from jaxcal.model.parameters import Parameters
-from jaxcal.model.unknowns import EXTRA, TABLE, Blocks
+from jaxcal.model.unknowns import FURTHER, TABLE, Blocks
 from jaxcal.runtime.compiler import traced_once
 from jaxcal.solvers import dense
 from jaxcal.solvers.closed_form.single import Start
@@ -59,24 +59,24 @@ class ConventionalStart(eqx.Module):
 
     fit: Descent
     start: Iterate
-    searched: Bool[Array, " lanes"]
+    searched: Bool[Array, " batch"]
 
     @property
-    def place(self) -> Iterate:
+    def iterate(self) -> Iterate:
         """The conventional fit, from which most methods start."""
-        return self.fit.place
+        return self.fit.iterate
 
 
 class GivenStart(eqx.Module):
     """Conventional fits that were found before.
 
     Attributes:
-        place: the conventional fits.
+        iterate: the conventional fits.
         searched: whether they had to be searched for.
     """
 
-    place: Iterate
-    searched: Bool[Array, " lanes"]
+    iterate: Iterate
+    searched: Bool[Array, " batch"]
 
     @classmethod
     def of(cls, start: Start, blocks: Blocks) -> GivenStart:
@@ -87,7 +87,7 @@ class GivenStart(eqx.Module):
 
 
 class Reduced(eqx.Module):
-    """The least-squares problem of the start with c and t eliminated; lanes last.
+    """The least-squares problem of the start with c and t eliminated; batch axis last.
 
     Half its objective is a'Qa / 2 - b'a, a = (a1, a3) in probe coordinates; points and pose origins
     are relative to their means.
@@ -100,25 +100,25 @@ class Reduced(eqx.Module):
         matrix: Q.
         rhs: b.
         squares: sums of squares of lateral position and range, mm^2.
-        turned: sums of lateral times R_i, range times R_i, side by side.
+        moments: sums of lateral times R_i and of range times R_i, side by side, mm.
         rotation: sum of R_i.
-        pulled: sum of R_i'(centre - b_i).
+        pulled: sum of R_i'(centre - b_i), mm.
         spread: inverse of t's normal matrix, c eliminated.
         least: smallest share of t's diagonal entries that eliminating c and the rest of t leaves.
     """
 
-    count: Float[Array, " lanes"]
-    mean: Float[Array, "2 lanes"]
-    face: Float[Array, " lanes"]
-    centre: Float[Array, "3 lanes"]
-    matrix: Float[Array, "6 6 lanes"]
-    rhs: Float[Array, "6 lanes"]
-    squares: Float[Array, "2 lanes"]
-    turned: Float[Array, "3 6 lanes"]
-    rotation: Float[Array, "3 3 lanes"]
-    pulled: Float[Array, "3 lanes"]
-    spread: Float[Array, "3 3 lanes"]
-    least: Float[Array, " lanes"]
+    count: Float[Array, " batch"]
+    mean: Float[Array, "2 batch"]
+    face: Float[Array, " batch"]
+    centre: Float[Array, "3 batch"]
+    matrix: Float[Array, "6 6 batch"]
+    rhs: Float[Array, "6 batch"]
+    squares: Float[Array, "2 batch"]
+    moments: Float[Array, "3 6 batch"]
+    rotation: Float[Array, "3 3 batch"]
+    pulled: Float[Array, "3 batch"]
+    spread: Float[Array, "3 3 batch"]
+    least: Float[Array, " batch"]
 
     @classmethod
     def of(cls, images: ImagePlanes) -> Reduced:
@@ -138,27 +138,27 @@ class Reduced(eqx.Module):
         sums = barrier(unrolled.as_array(total(planes)))
         parts = sums[3:].reshape(3, 12, -1)
         lateral, axial, rotation = parts[:, :9].reshape(3, 3, 3, -1)
-        turned = jnp.concatenate([lateral, axial], axis=1)
+        moments = jnp.concatenate([lateral, axial], axis=1)
 
         # c is the mean of B_i X p_i; then t.
         def squared(first: Array, second: Array) -> Array:
-            return dense.product_lanes_last(jnp.swapaxes(first, 0, 1), second) / count
+            return dense.product_batch_last(jnp.swapaxes(first, 0, 1), second) / count
 
         eye = jnp.eye(3, dtype=x.dtype)[..., None]
         ridge = 2e-12 + 32 * jnp.finfo(x.dtype).eps
         own = barrier(count * (1 + ridge) * eye - squared(rotation, rotation))
-        spread, _ = dense.inverse_lanes_last(own)
-        mixed = squared(rotation, turned)
-        follows = barrier(dense.product_lanes_last(spread, mixed))
+        spread, _ = dense.inverse_batch_last(own)
+        mixed = squared(rotation, moments)
+        follows = barrier(dense.product_batch_last(spread, mixed))
         back_from_t = jnp.swapaxes(mixed, 0, 1)
         # S (x) I: sums of squares and products of the points' coordinates.
         square = jnp.stack([jnp.stack(sums[:2]), jnp.stack(sums[1:3])])
         whole = square[:, None, :, None] * eye[None, :, None]
-        matrix = whole.reshape(6, 6, -1) - squared(turned, turned)
-        matrix = barrier(matrix - dense.product_lanes_last(back_from_t, follows))
+        matrix = whole.reshape(6, 6, -1) - squared(moments, moments)
+        matrix = barrier(matrix - dense.product_batch_last(back_from_t, follows))
         pulled = parts[2, 9:]
         rhs = parts[:2, 9:].reshape(6, -1)
-        rhs = rhs + dense.product_lanes_last(jnp.swapaxes(follows, 0, 1), pulled)
+        rhs = rhs + dense.product_batch_last(jnp.swapaxes(follows, 0, 1), pulled)
         squares = jnp.stack([sums[0], sums[2]])
         left = jnp.stack([count * spread[k, k] for k in range(3)])
         return cls(
@@ -169,7 +169,7 @@ class Reduced(eqx.Module):
             matrix,
             rhs,
             squares,
-            turned,
+            moments,
             rotation,
             pulled,
             spread,
@@ -180,7 +180,7 @@ class Reduced(eqx.Module):
         """X's origin, the target and free scales by linear least squares with X's rotation held.
 
         Args:
-            lateral: its first column, (3, lanes).
+            lateral: its first column, (3, batch).
             axial: its last column.
             blocks: the free unknowns.
         """
@@ -191,27 +191,27 @@ class Reduced(eqx.Module):
             tiny = jnp.finfo(one.dtype).tiny
             scale = jnp.maximum(jnp.abs(self._scales(lateral, axial)), tiny)
         columns = jnp.concatenate([scale[0] * lateral, scale[1] * axial])
-        seen = dense.product_lanes_last(self.turned, columns)
-        pull = dense.product_lanes_last(jnp.swapaxes(self.rotation, 0, 1), seen) / self.count
-        of_mean = barrier(dense.product_lanes_last(self.spread, self.pulled + pull))
-        target = seen + dense.product_lanes_last(self.rotation, of_mean)
+        seen = dense.product_batch_last(self.moments, columns)
+        pull = dense.product_batch_last(jnp.swapaxes(self.rotation, 0, 1), seen) / self.count
+        of_mean = barrier(dense.product_batch_last(self.spread, self.pulled + pull))
+        target = seen + dense.product_batch_last(self.rotation, of_mean)
         depth = scale[1] * (self.mean[1] - self.face) + self.face
-        free = {name: [TABLE[name].nominal * one] * TABLE[name].size for name in EXTRA}
+        free = {name: [TABLE[name].nominal * one] * TABLE[name].size for name in FURTHER}
         free["scale"] = [*scale]
-        extras = [value for name in EXTRA if name in blocks for value in free[name]]
+        values = [value for name in FURTHER if name in blocks for value in free[name]]
         return Iterate(
             jnp.stack([lateral, jnp.cross(axial, lateral, axis=0), axial], axis=1),
             of_mean - scale[0] * self.mean[0] * lateral - depth * axial,
             self.centre + target / self.count,
-            jnp.stack(extras) if extras else jnp.zeros((0, *one.shape), one.dtype),
+            jnp.stack(values) if values else jnp.zeros((0, *one.shape), one.dtype),
             blocks,
         )
 
-    def _scales(self, lateral: Array, axial: Array) -> Float[Array, "2 lanes"]:
+    def _scales(self, lateral: Array, axial: Array) -> Float[Array, "2 batch"]:
         """The scales that fit best, given two columns of a rotation."""
         forces = [
-            dense.product_lanes_last(self.matrix[:, :3], lateral),
-            dense.product_lanes_last(self.matrix[:, 3:], axial),
+            dense.product_batch_last(self.matrix[:, :3], lateral),
+            dense.product_batch_last(self.matrix[:, 3:], axial),
         ]
         first, mixed, second = (
             jnp.sum(lateral * forces[0][:3], axis=0),
@@ -233,11 +233,11 @@ class Reduced(eqx.Module):
 
 def closed_form(
     images: ImagePlanes, blocks: Blocks
-) -> tuple[Iterate, Bool[Array, " lanes"], Reduced]:
+) -> tuple[Iterate, Bool[Array, " batch"], Reduced]:
     """The start, whether it is sound, and the sums from which it is computed."""
     sums = Reduced.of(images)
-    inverse, _ = dense.inverse_lanes_last(sums.matrix)
-    columns = barrier(dense.product_lanes_last(inverse, sums.rhs))
+    inverse, _ = dense.inverse_batch_last(sums.matrix)
+    columns = barrier(dense.product_batch_last(inverse, sums.rhs))
     left = jnp.stack([sums.squares[k // 3] * inverse[k, k] for k in range(6)])
     least = jnp.minimum(sums.least, 1 / jnp.max(left, axis=0))
     a, b = columns[:3], columns[3:]
@@ -282,12 +282,12 @@ def conventional(
     observation = InPlane.of(images)
     fit_from, empty = traced_once(fit_from, start, observation, images)
 
-    # The loop's first round starts in closed form. It has further rounds only where some lane's
+    # The loop's first round starts in closed form. It has further rounds only where some problem's
     # start was unsound, so the search costs nothing where it is not needed.
     def one_round(state: tuple) -> tuple:
         index, best = state
         cube = cubes[jnp.maximum(index - 1, 0)]
-        cube = jnp.broadcast_to(cube[..., None], (3, 3, images.lanes))
+        cube = jnp.broadcast_to(cube[..., None], (3, 3, images.batch_size))
         first = choose(index == 0, start, sums.with_rotation(cube[:, 0], cube[:, 2], blocks))
         fit = fit_from(barrier(first), observation, images)
         lower = (fit.cost < best.cost) | ~jnp.isfinite(best.cost)
@@ -300,9 +300,9 @@ def conventional(
 
     _, fit = jax.lax.while_loop(unfinished, one_round, (jnp.zeros((), jnp.int32), empty))
     if not fitted:
-        # A sound lane keeps its start, even if other lanes needed the search.
-        fit = replace(fit, place=choose(sound, start, fit.place))
-    return ConventionalStart(fit, choose(sound, start, fit.place), jnp.logical_not(sound))
+        # A sound problem keeps its start, even if others needed the search.
+        fit = replace(fit, iterate=choose(sound, start, fit.iterate))
+    return ConventionalStart(fit, choose(sound, start, fit.iterate), jnp.logical_not(sound))
 
 
 def cube_rotations() -> np.ndarray:

@@ -103,8 +103,8 @@ def experiments(
 
 
 def _grouped(values: Array) -> Array:
-    lanes = len(values)
-    group = SEGMENTED if lanes % SEGMENTED == 0 else lanes
+    trials = len(values)
+    group = SEGMENTED if trials % SEGMENTED == 0 else trials
     return values.reshape(-1, group, *values.shape[1:])
 
 
@@ -121,16 +121,16 @@ def _images(rotation: Array, origin: Array, lateral: Array, distance: Array) -> 
 
 def problems_of(images: ImagePlanes) -> Problem:
     """The images as problems with a leading axis; arrays that are not read are not computed."""
-    lanes, count = images.mask.shape
-    rotation = jnp.moveaxis(images.rotation, 0, -1).reshape(lanes, count, 3, 3)
+    trials, count = images.mask.shape
+    rotation = jnp.moveaxis(images.rotation, 0, -1).reshape(trials, count, 3, 3)
     top = jnp.concatenate([rotation, jnp.moveaxis(images.origin, 0, -1)[..., None]], axis=-1)
-    bottom = jnp.broadcast_to(jnp.asarray([0.0, 0.0, 0.0, 1.0]), (lanes, count, 1, 4))
+    bottom = jnp.broadcast_to(jnp.asarray([0.0, 0.0, 0.0, 1.0]), (trials, count, 1, 4))
     return Problem(
         poses=jnp.concatenate([top, bottom], axis=-2),
         measurements=jnp.stack([images.lateral, images.distance], axis=-1),
         mask=images.mask,
-        spacing=jnp.ones((lanes, 2)),
-        face_offset=jnp.zeros(lanes),
+        spacing=jnp.ones((trials, 2)),
+        face_offset=jnp.zeros(trials),
     )
 
 
@@ -160,18 +160,18 @@ def solve(
     # Parts of the calibration that are not used are not computed.
     found = solve_problems(problems, given, plan, begun=begun)
     matrix = jnp.asarray(found.image_to_probe)
-    place = Iterate(
+    iterate = Iterate(
         jnp.moveaxis(matrix[:, :3, :3], 0, -1),
         matrix[:, :3, 3].T,
         jnp.asarray(found.point).T,
-        truth.extras,
+        truth.further_values,
         truth.blocks,
     )
-    pairs = ((place.translation, truth.translation), (place.point, truth.point))
+    pairs = ((iterate.translation, truth.translation), (iterate.point, truth.point))
     away = [jnp.sqrt(jnp.sum((one - true) ** 2, axis=0)) for one, true in pairs]
     return Measured(
-        rp=_precision(place, truth, batch.test),
-        rotation_error=chord_angle(place.rotation - truth.rotation),
+        rp=_precision(iterate, truth, batch.test),
+        rotation_error=chord_angle(iterate.rotation - truth.rotation),
         translation_error=away[0],
         point_error=away[1],
         sigma=jnp.asarray(found.sigma),
@@ -180,25 +180,25 @@ def solve(
     )
 
 
-def _mean_squares(place: Iterate, images: ImagePlanes) -> Float[Array, "3 lanes"]:
+def _mean_squares(iterate: Iterate, images: ImagePlanes) -> Float[Array, "3 batch"]:
     """Mean squares of lateral error, range error and elevational offset at an estimate, mm^2."""
-    q, _ = targets(place, images)
+    q, _ = targets(iterate, images)
     far = jnp.sqrt(q[1] * q[1] + q[2] * q[2])
     errors = [q[0] - images.lateral, far - images.distance, q[1]]
     return jnp.stack(total([images.mask * error * error for error in errors])) / images.used
 
 
-def _precision(place: Iterate, truth: Iterate, test: ImagePlanes) -> Float[Array, " lanes"]:
+def _precision(iterate: Iterate, truth: Iterate, test: ImagePlanes) -> Float[Array, " batch"]:
     """Eq. 8, as :func:`jaxcal.diagnostics.metrics.reconstruction_precision`, mm.
 
     Reconstructed points are taken relative to the true target. They are near it, so that one pass
     gives their mean and spread without loss of digits.
     """
-    rows = [[entry[:, None] for entry in row] for row in place.rotation]
+    rows = [[entry[:, None] for entry in row] for row in iterate.rotation]
     flat = [test.lateral, 0, test.distance]
     in_probe = [
         value + origin[:, None]
-        for value, origin in zip(unrolled.apply(rows, flat), place.translation, strict=True)
+        for value, origin in zip(unrolled.apply(rows, flat), iterate.translation, strict=True)
     ]
     poses = [[test.rotation[3 * i + j] for j in range(3)] for i in range(3)]
     away = [

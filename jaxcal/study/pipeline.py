@@ -41,10 +41,10 @@ from jaxcal.study.own import Chunk
 from jaxcal.study.simulation import Protocol
 from jaxcal.study.spec import Condition, MethodSpec, Spec
 
-LANES = {"cpu": 64}
+BATCH_SIZE = {"cpu": 64}
 """Trials drawn or solved side by side on a device; on a CPU what they need stays in its caches."""
 
-OTHER_LANES = 4096
+OTHER_BATCH_SIZE = 4096
 """The same for other devices: enough to fill one."""
 
 MOST_PIECES = 8
@@ -94,12 +94,12 @@ def compute_chunk(spec: Spec, chunk: Chunk) -> dict[str, np.ndarray]:
         drawn, mm. They depend neither on what was computed before nor on the worker.
     """
     condition, devices = spec.condition(chunk.condition), tuple(jax.local_devices())
-    pieces, lanes = _block(spec, devices)
+    pieces, size = _block(spec, devices)
     blocks = []
-    for start in range(chunk.start, chunk.stop, pieces * lanes):
-        trials = np.minimum(start + np.arange(pieces * lanes), chunk.stop - 1)
+    for start in range(chunk.start, chunk.stop, pieces * size):
+        trials = np.minimum(start + np.arange(pieces * size), chunk.stop - 1)
         indices = (chunk.condition * spec.trials + trials).astype(np.uint32)
-        indices = indices.reshape(pieces, lanes)
+        indices = indices.reshape(pieces, size)
         drawn = Block(spec, condition, indices, devices)
         measured = [drawn.measured(method) for method in spec.methods]
         results = {name: np.stack([one[name] for one in measured]) for name in measured[0]}
@@ -115,10 +115,10 @@ def compute_chunk(spec: Spec, chunk: Chunk) -> dict[str, np.ndarray]:
 
 def _block(spec: Spec, devices: Devices) -> tuple[int, int]:
     """How many pieces of how many trials a call gets: the same for all chunks of a study."""
-    lanes = LANES.get(devices[0].platform, OTHER_LANES)
-    needed = -(-spec.chunk_trials // (lanes * len(devices)))
+    size = BATCH_SIZE.get(devices[0].platform, OTHER_BATCH_SIZE)
+    needed = -(-spec.chunk_trials // (size * len(devices)))
     calls = -(-needed // MOST_PIECES)
-    return -(-needed // calls) * len(devices), lanes
+    return -(-needed // calls) * len(devices), size
 
 
 class Block:

@@ -33,7 +33,7 @@ from jaxcal.data.segmentation.time_of_flight import (
 )
 from jaxcal.runtime import executables
 from jaxcal.runtime.array_types import AnyArray
-from jaxcal.runtime.compiler import ONE_PROBLEM, batch_wishes, fast_to_run
+from jaxcal.runtime.compiler import ONE_PROBLEM, batch_flags, fast_to_run
 from jaxcal.runtime.given_values import check_flag, is_number, whole_number
 from jaxcal.runtime.messages import shown
 from jaxcal.runtime.precision import in_own_modes
@@ -414,7 +414,7 @@ def _fitted(
         "jaxcal.data.segmentation.segment:fit_frames",
         (padded, np.asarray(positions, float)),
         how,
-        flags=ONE_PROBLEM if count <= _FEW_FRAMES else batch_wishes(),
+        flags=ONE_PROBLEM if count <= _FEW_FRAMES else batch_flags(),
         label={"method": "segmentation", "data": "channels", "images": len(padded)},
     )
     return jax.tree.map(lambda leaf: leaf[:count], found)

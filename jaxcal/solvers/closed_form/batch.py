@@ -48,7 +48,7 @@ from jaxcal.solvers.closed_form.reduced_objective import (
 )
 from jaxcal.solvers.closed_form.single import ClosedForm, solve_problem
 
-LANES = 256
+CHUNK = 256
 """Problems in one call of the compiled program."""
 
 NEWTON_STEPS = 30
@@ -84,24 +84,26 @@ def solve_batch(problems: Problem, estimate: tuple[str, ...]) -> ClosedForm:
     if any(is_traced(leaf) for leaf in jax.tree.leaves(problems)):
         with own_modes(bits_too=False):
             require_float64("jaxcal.calibrate_closed_form")
-            answer = solve_lanes(with_dtype(flat, np.float64), estimate)
+            answer = solve_traceable(with_dtype(flat, np.float64), estimate)
     else:
         answer = _concrete(jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), flat), estimate)
     return jax.tree.map(lambda leaf: leaf.reshape((*shape, *leaf.shape[1:])), answer)
 
 
-_compiled = jax.jit(lambda problems, estimate: solve_lanes(problems, estimate), static_argnums=1)
+_compiled = jax.jit(
+    lambda problems, estimate: solve_traceable(problems, estimate), static_argnums=1
+)
 
 
 def _concrete(problems: Problem, estimate: tuple[str, ...]) -> ClosedForm:
     count = len(problems.mask)
-    lanes = min(LANES, count)
+    size = min(CHUNK, count)
     parts = []
     with own_modes():
-        for start in range(0, count, lanes):
-            rows = slice(start, start + lanes)
+        for start in range(0, count, size):
+            rows = slice(start, start + size)
             part = jax.tree.map(lambda leaf, rows=rows: leaf[rows], problems)
-            short = lanes - len(part.mask)
+            short = size - len(part.mask)
             if short:
                 part = jax.tree.map(
                     lambda leaf, short=short: np.concatenate([leaf, np.repeat(leaf[:1], short, 0)]),
@@ -111,19 +113,19 @@ def _concrete(problems: Problem, estimate: tuple[str, ...]) -> ClosedForm:
     answer = jax.tree.map(
         lambda *leaves: np.concatenate([np.asarray(leaf) for leaf in leaves])[:count], *parts
     )
-    for lane in np.flatnonzero(~answer.certified):
-        one = jax.tree.map(lambda leaf, lane=lane: leaf[lane], problems)
+    for k in np.flatnonzero(~answer.certified):
+        one = jax.tree.map(lambda leaf, k=k: leaf[k], problems)
         try:
             alone = solve_problem(one, estimate)
         except InputError:
             continue
         for field in fields(ClosedForm):
             if getattr(answer, field.name) is not None:
-                getattr(answer, field.name)[lane] = getattr(alone, field.name)
+                getattr(answer, field.name)[k] = getattr(alone, field.name)
     return answer
 
 
-def solve_lanes(problems: Problem, estimate: tuple[str, ...]) -> ClosedForm:
+def solve_traceable(problems: Problem, estimate: tuple[str, ...]) -> ClosedForm:
     """Solve problems with one leading axis by array operations alone.
 
     Traceable and differentiable. Where the dual is not tight ``certified`` is False, and the
@@ -208,7 +210,7 @@ def solve_lanes(problems: Problem, estimate: tuple[str, ...]) -> ClosedForm:
 
 
 def _normal(spread: Array, turned: Array, pulled: Array, count: Array) -> tuple[Matrix, Vector]:
-    """Normal equations of (a1, a3, t), c eliminated, as matrix and right side over the lanes."""
+    """Normal equations of (a1, a3, t), c eliminated, as matrix and right side; batch axis last."""
     size = 9
     full: Matrix = [[0] * size for _ in range(size)]
     for a in range(2):
@@ -252,7 +254,7 @@ def _rows(stacked: Array) -> Matrix:
 
 
 def _with_multipliers(constraints: QuadraticConstraints, matrix: Array, values: Array) -> Matrix:
-    """M as rows over the lanes."""
+    """M as rows; batch axis last."""
     rows = _rows(matrix)
     for each, value in zip(constraints.matrices, values, strict=True):
         for i, j in zip(*np.nonzero(each), strict=True):
@@ -279,9 +281,9 @@ def _off(constraints: QuadraticConstraints, x: Vector) -> Vector:
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _optimum(
     estimate: tuple[str, ...],
-    matrix: Float[Array, "6 6 lanes"],
-    vector: Float[Array, "6 lanes"],
-) -> tuple[Float[Array, "6 lanes"], Float[Array, "k lanes"]]:
+    matrix: Float[Array, "6 6 batch"],
+    vector: Float[Array, "6 batch"],
+) -> tuple[Float[Array, "6 batch"], Float[Array, "k batch"]]:
     """The x and the multipliers at the dual's maximum, by Newton's method; NaN where that fails."""
     constraints = CONSTRAINTS[estimate]
     first = jnp.stack(unrolled.solve(_rows(matrix), list(vector)))
@@ -290,7 +292,7 @@ def _optimum(
     if not constraints.free:
         # With these multipliers |x| is at most 1, so they lie far inside.
         inside = inside.at[:2].set(jnp.sqrt(jnp.sum(vector**2, axis=0)))
-    lanes = vector.shape[1]
+    count = vector.shape[1]
 
     def evaluate(values: Array) -> tuple[Array, Array, Array]:
         factor, pivots = unrolled.cholesky(_with_multipliers(constraints, matrix, values))
@@ -330,8 +332,8 @@ def _optimum(
         jnp.zeros((), jnp.int32),
         start,
         jnp.zeros_like(start),
-        jnp.full((6, lanes), jnp.nan, vector.dtype),
-        jnp.full(lanes, jnp.inf, vector.dtype),
+        jnp.full((6, count), jnp.nan, vector.dtype),
+        jnp.full(count, jnp.inf, vector.dtype),
     )
     _, values, _, x, _ = jax.lax.while_loop(unfinished, body, state)
     return x, values
@@ -365,8 +367,8 @@ def _multipliers(
 
 
 def _feasible(
-    x: Float[Array, "6 lanes"], constraints: QuadraticConstraints
-) -> Float[Array, "6 lanes"]:
+    x: Float[Array, "6 batch"], constraints: QuadraticConstraints
+) -> Float[Array, "6 batch"]:
     """The nearest orthonormal pair, with the scales that are free."""
     pair = x.reshape(2, 3, -1)
     lengths = jnp.sqrt(jnp.sum(pair**2, axis=1))
@@ -382,7 +384,7 @@ def _feasible(
 
 def _gap(
     constraints: QuadraticConstraints, matrix: Array, vector: Array, x: Array, values: Array
-) -> tuple[Float[Array, " lanes"], Float[Array, " lanes"], Bool[Array, " lanes"]]:
+) -> tuple[Float[Array, " batch"], Float[Array, " batch"], Bool[Array, " batch"]]:
     """f(x) less the bound that the multipliers prove, M's least pivot, whether it is definite."""
     rows = _with_multipliers(constraints, matrix, values)
     factor, pivots = unrolled.cholesky(rows)

@@ -30,42 +30,42 @@ MOST_UPDATES = 60
 
 
 class Fit(eqx.Module):
-    """Where the solver stopped; lanes last.
+    """Where the solver stopped; batch axis last.
 
     Attributes:
-        place: X, c and the further unknowns.
+        iterate: X, c and the further unknowns.
         cost: sum of squared (whitened) residuals.
         cosine: gradient cosine there.
-        settled: the solver says that it converged.
+        converged: by the solver's own rule.
         iterations: the solver's steps.
         updated: SDs after the last update, mm; those given where none are tuned.
         trace: NaN, since the solver does not tell its values; None: not kept.
     """
 
-    place: Iterate
-    cost: Float[Array, " lanes"]
-    cosine: Float[Array, " lanes"]
-    settled: Bool[Array, " lanes"]
-    iterations: Int[Array, " lanes"]
-    updated: Float[Array, "k lanes"]
-    trace: Float[Array, "trace lanes"] | None
+    iterate: Iterate
+    cost: Float[Array, " batch"]
+    cosine: Float[Array, " batch"]
+    converged: Bool[Array, " batch"]
+    iterations: Int[Array, " batch"]
+    updated: Float[Array, "k batch"]
+    trace: Float[Array, "trace batch"] | None
 
     @classmethod
     def of(
         cls,
         found: optx.Solution,
-        place: Iterate,
+        iterate: Iterate,
         start: Iterate,
         observation: Observation,
         images: ImagePlanes,
         medium: MediumPrior | None,
         trace: int,
     ) -> Fit:
-        """From a solver's result for one problem, the place that it stands for, and the start."""
-        normal = accumulate(place, observation, images, None, medium)
+        """From a solver's result for one problem, the iterate that it stands for, and the start."""
+        normal = accumulate(iterate, observation, images, None, medium)
         rounding = Rounding.of(start, observation, images)
         return cls(
-            place,
+            iterate,
             normal.cost,
             gradient_cosine(normal, rounding.vanished),
             (found.result == optx.RESULTS.successful)[None],
@@ -76,19 +76,19 @@ class Fit(eqx.Module):
 
 
 def whitened_residuals(
-    place: Iterate, observation: Observation, images: ImagePlanes, medium: MediumPrior | None
-) -> Float[Array, "residuals lanes"]:
-    """All residuals of every lane in SDs, zeros where an image is left out; lanes last."""
-    q, axes = targets(place, images)
+    iterate: Iterate, observation: Observation, images: ImagePlanes, medium: MediumPrior | None
+) -> Float[Array, "residuals batch"]:
+    """All residuals of every problem in SDs, zeros where an image is left out; batch axis last."""
+    q, tracker_to_image = targets(iterate, images)
     parts = []
-    found = observation.components(q, Further.at(place, axes), images)
+    found = observation.components(q, Further.at(iterate, tracker_to_image), images)
     for component, sd in zip(found, observation.sigma, strict=True):
         for error in component.errors:
             white = weight_of(component, images) * error / sd.reshape(-1, *(1,) * (error.ndim - 1))
-            parts.append(white.reshape(images.lanes, -1).T)
+            parts.append(white.reshape(images.batch_size, -1).T)
     if medium is not None:
         parts += [
-            (away * jnp.sqrt(precision))[None] for _, away, precision in medium.deviations(place)
+            (away * jnp.sqrt(precision))[None] for _, away, precision in medium.deviations(iterate)
         ]
     return jnp.concatenate(parts)
 
@@ -107,8 +107,8 @@ def minimise_with(
         solver: of optimistix.
         start: unknowns to start from.
         observation: the objective.
-        images: the data, of one lane.
-        medium: what is known of sound speed and delay beforehand.
+        images: the data, a batch of one.
+        medium: prior of sound speed and delay, or None.
         options: with the largest number of steps and the length of the trace.
     """
 
@@ -120,8 +120,8 @@ def minimise_with(
     found = optx.least_squares(
         residual, solver, still, max_steps=options.max_iterations, throw=False
     )
-    place = start.moved(found.value[:, None])
-    return Fit.of(found, place, start, observation, images, medium, options.trace)
+    iterate = start.moved(found.value[:, None])
+    return Fit.of(found, iterate, start, observation, images, medium, options.trace)
 
 
 def self_tuned_with(
@@ -138,8 +138,8 @@ def self_tuned_with(
         solver: of optimistix.
         start: the conventional fit.
         observation: the objective; its SDs are held where too few images determine them.
-        images: the data, of one lane.
-        medium: what is known of sound speed and delay beforehand.
+        images: the data, a batch of one.
+        medium: prior of sound speed and delay, or None.
         options: with the largest number of steps of each solve.
     """
     enough = images.used >= MINIMUM_SELF_TUNING
@@ -147,10 +147,10 @@ def self_tuned_with(
     crude = with_floor(jnp.sqrt(squares / observation.count(images)))
     first = jnp.where(enough, crude, observation.sigma)
 
-    def solve(place: Iterate, sigma: Array) -> Fit:
+    def solve(iterate: Iterate, sigma: Array) -> Fit:
         observed = observation.with_sigma(sigma)
-        fit = minimise_with(solver, place, observed, images, medium, options)
-        updated = update_at(fit.place, sigma, observation, images, medium)[1]
+        fit = minimise_with(solver, iterate, observed, images, medium, options)
+        updated = update_at(fit.iterate, sigma, observation, images, medium)[1]
         return eqx.tree_at(lambda f: f.updated, fit, updated)
 
     solve, empty = traced_once(solve, start, first)
@@ -161,10 +161,10 @@ def self_tuned_with(
 
     def one_round(state: tuple) -> tuple:
         fit, sigma, rounds, change, taken = state
-        after = solve(fit.place, sigma)
+        after = solve(fit.iterate, sigma)
         moving = change > TOLERANCE
         moved = jnp.max(jnp.abs(jnp.log(after.updated / sigma)), axis=0)
-        # A lane that is lost (NaN) must stop, not hold up its neighbours.
+        # A problem that is lost (NaN) must stop, not hold up the others.
         moved = jnp.where(jnp.isfinite(moved), moved, 0.0)
         after, sigma, change, taken = choose(
             moving,
@@ -173,9 +173,9 @@ def self_tuned_with(
         )
         return after, sigma, rounds + 1, change, taken
 
-    empty = eqx.tree_at(lambda fit: fit.place, empty, start)
+    empty = eqx.tree_at(lambda fit: fit.iterate, empty, start)
     one = jnp.ones_like(first[0])
     state = (empty, first, jnp.zeros((), jnp.int32), one, jnp.zeros(one.shape, jnp.int32))
     fit, _, _, change, taken = jax.lax.while_loop(unfinished, one_round, state)
-    done = fit.settled & (change <= TOLERANCE)
-    return eqx.tree_at(lambda f: (f.settled, f.iterations), fit, (done, taken))
+    done = fit.converged & (change <= TOLERANCE)
+    return eqx.tree_at(lambda f: (f.converged, f.iterations), fit, (done, taken))
