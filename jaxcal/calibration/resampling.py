@@ -22,7 +22,13 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
 from jaxcal import InputError
-from jaxcal.calibration.calibrate import calibrate, calibrate_batch
+from jaxcal.calibration.calibrate import (
+    Request,
+    calibrate,
+    calibrate_batch,
+    prepare,
+    unknown_names,
+)
 from jaxcal.calibration.dependence import independent
 from jaxcal.data.problem import Problem, as_problem
 from jaxcal.data.recording import MINIMUM_IMAGES, Recording
@@ -36,6 +42,7 @@ from jaxcal.runtime.given_values import LARGEST_SEED, check_key, check_made, who
 from jaxcal.runtime.messages import shown
 from jaxcal.runtime.precision import in_own_modes
 from jaxcal.solvers import dense
+from jaxcal.solvers.plan import SolvePlan
 
 LARGEST_RESAMPLES = 100_000
 
@@ -125,18 +132,15 @@ def cross_validate(
         InputError: too few images, folds that are not from 2 to the number of images, options that
             contradict each other, or a result by another method than they ask for.
     """
-    problem = _one_problem(problem, arguments, "jaxcal.cross_validate")
+    problem, plan = _one_problem(problem, arguments, "jaxcal.cross_validate")
     count = problem.images
     folds = count if folds is None else whole_number("folds", folds, 2, count)
-    result = _of_all_images(problem, result, arguments)
+    result = _of_all_images(problem, result, plan, arguments)
     problem = replace(problem, mask=jnp.asarray(result.mask, problem.mask.dtype))
     fold = np.arange(count) % folds
     rest = jnp.asarray(fold[None, :] != np.arange(folds)[:, None], problem.mask.dtype)
     _check_left(problem.mask, rest)
-    # Outliers were found with all images, so no fold looks for them again.
-    options: dict[str, Any] = {**arguments, "robust": False}
-    fits = calibrate_batch(_many(problem, problem.mask * rest), **options)
-    _check_alike(result, fits)
+    fits = calibrate_batch(_many(problem, problem.mask * rest), **_of_each(arguments))
     return _compared(problem, result, fits, fold)
 
 
@@ -204,24 +208,19 @@ def bootstrap(
         InputError: fewer than 2 resamples, options that contradict each other, or a result by
             another method than they ask for.
     """
-    problem = _one_problem(problem, arguments, "jaxcal.bootstrap")
+    problem, plan = _one_problem(problem, arguments, "jaxcal.bootstrap")
     resamples = whole_number("resamples", resamples, 2, LARGEST_RESAMPLES)
     if isinstance(key, jax.Array):
         check_key("key", key)
         root = key
     else:
         root = jax.random.key(whole_number("key", key, 0, LARGEST_SEED))
-    result = _of_all_images(problem, result, arguments)
+    result = _of_all_images(problem, result, plan, arguments)
     mask = jnp.asarray(result.mask, problem.mask.dtype)
     problem = replace(problem, mask=mask)
     rows = _rows(root, mask, resamples)
     # Each draw has as many images as were used, since the mask leaves out the other rows.
-    options: dict[str, Any] = {**arguments, "robust": False}
-    bound: Any = options.get("max_elevation")
-    if np.shape(bound) == (problem.images,):
-        options["max_elevation"] = jnp.asarray(bound)[rows]  # drawn with its image
-    fits = calibrate_batch(_drawn(problem, rows, mask), **options)
-    _check_alike(result, fits)
+    fits = calibrate_batch(_drawn(problem, rows, mask), **_of_each(arguments))
     return _scatter(problem, result, fits)
 
 
@@ -303,41 +302,59 @@ def _apart(
 
 
 def _of_all_images(
-    problem: Problem, result: Calibration | None, arguments: dict[str, Any]
+    problem: Problem, result: Calibration | None, plan: SolvePlan, arguments: dict[str, Any]
 ) -> Calibration:
     """The calibration of all images: the caller's, checked, or a new one."""
     if result is None:
-        return calibrate(problem, **arguments)
+        return calibrate(problem, **_of_one(arguments))
     check_made("result", result, Calibration, "jaxcal.calibrate")
     if np.shape(result.mask) != (problem.images,):
         raise InputError(
             f"result must be the calibration of these {problem.images} images; its mask has shape "
             f"{np.shape(result.mask)}"
         )
-    return result
-
-
-def _check_alike(result: Calibration, fits: Calibration) -> None:
-    """Refuse the caller's calibration where it was made in another way than the fits."""
-    for name in ("method", "prior", "data", "blocks"):
-        given, own = getattr(result, name), getattr(fits, name)
+    for name, own in (
+        ("method", plan.method),
+        ("prior", plan.reported_prior),
+        ("data", "channels" if plan.channels else "points"),
+        ("blocks", plan.blocks),
+    ):
+        given = getattr(result, name)
         if given != own:
             raise InputError(
                 f"result has {name} {shown(given)}, and the arguments ask for {shown(own)}: give "
                 "those that the result was made with, or no result"
             )
+    return result
 
 
-def _one_problem(problem: Problem | Recording, arguments: dict[str, Any], name: str) -> Problem:
-    """One problem; if its values are concrete, every pose counts once."""
+def _of_one(arguments: dict[str, Any]) -> dict[str, Any]:
+    """The arguments without the bound on the offsets, which is the problem's now."""
+    return {name: value for name, value in arguments.items() if name != "max_elevation"}
+
+
+def _of_each(arguments: dict[str, Any]) -> dict[str, Any]:
+    """The same for parts of the problem: outliers were found with all images."""
+    return {**_of_one(arguments), "robust": False}
+
+
+def _one_problem(
+    problem: Problem | Recording, arguments: dict[str, Any], name: str
+) -> tuple[Problem, SolvePlan]:
+    """One problem with its bounds, and how it is solved.
+
+    If its values are concrete, every pose counts once.
+    """
     problem = as_problem(problem, name)
     if problem.batch_shape:
         raise InputError("resampling takes one problem at a time, not a batch")
+    estimate = unknown_names(arguments.get("estimate", ()))
+    problem, plan, _ = prepare(problem, Request(**{**arguments, "estimate": estimate}), name)
     if any(is_traced(leaf) for leaf in jax.tree.leaves(problem)):
-        return problem
-    alone = independent(problem, arguments.get("estimate", ()))[0]
+        return problem, plan
+    alone = independent(problem, estimate)[0]
     # If JAX's 64 bits are off, a problem holds numpy arrays, which a traced index cannot index.
-    return jax.tree.map(jnp.asarray, alone)
+    return jax.tree.map(jnp.asarray, alone), plan
 
 
 def _check_left(mask: Array, rest: Array) -> None:
