@@ -439,6 +439,10 @@ def test_test_images_that_scatter_contradict_the_error(record):
     assert changed["verdict"] == "uncertain"
     assert changed["tre"]["rms_mm"] == pytest.approx(55.7, rel=0.01)
     assert "the test images scatter by 55.70 mm, where" in " ".join(verdict(changed))
+    # Of which a tracker with errors of 20 mm explains the most.
+    changed["tracker_sd_mm"] = 20.0
+    settle(changed)
+    assert changed["tre"]["factor"] == 1.0
 
 
 @pytest.mark.parametrize("shift_mm", [0.0, 6.0])

@@ -100,6 +100,7 @@ def calibration_record(
         "sigma_lateral_mm": answer.sigma[0],
         "sigma_range_mm": answer.sigma[1],
         "sigma_elevation_mm": answer.sigma[2],
+        "tracker_sd_mm": answer.linearisation.tracker_sd,
         "covariance": answer.covariance if known else None,
         "image_unknowns": tangent_names(transform.unknowns),
         "image_covariance": full[rows[:, None], rows] if known else None,
