@@ -15,9 +15,18 @@ from oracle.model import Data, Unknowns, errors
 from scipy.stats import norm
 
 import jaxcal
-from jaxcal.calibration.resampling import _compared, bootstrap, cross_validate, relative_twist
+from jaxcal.calibration.resampling import (
+    _compared,
+    _of_image,
+    bootstrap,
+    cross_validate,
+    relative_twist,
+)
 from jaxcal.cli.main import main
+from jaxcal.data.sound import WATER_M_S
 from jaxcal.diagnostics import metrics
+from jaxcal.model.image_points import distance
+from jaxcal.result.calibration import Medium
 
 CONVENTIONAL: dict[str, Any] = {"method": "conventional"}
 COUNT = 20
@@ -124,6 +133,40 @@ def test_an_images_bound_is_drawn_with_it(data, whole):
     given = bootstrap(data, 2, **asked, result=result, max_elevation=bound)
     held = bootstrap(replace(data, max_elevation=bound), 2, **asked, result=result)
     np.testing.assert_array_equal(given.image_to_probe, held.image_to_probe)
+
+
+def test_a_pixel_has_other_places_in_the_images_of_other_calibrations(data):
+    """Pixel sizes stretch what lies above row 0 of the image, but not the range of row 0."""
+    pixels = np.asarray(data.measurements - jnp.array([0.0, 4.0])) / [0.12, 0.1]
+    images = jaxcal.make_images(
+        np.asarray(data.poses), pixels, "pixel", spacing_mm=(0.12, 0.1), face_offset_mm=4.0
+    )
+    whole, other = (
+        jaxcal.calibrate(
+            jaxcal.Problem.from_recording(replace(images, mask=np.arange(COUNT) >= first)),
+            method="conventional",
+            estimate="scale",
+        )
+        for first in (0, 8)
+    )
+    assert whole.problem is not None
+    # As if the sound speed and the delay had been estimated, too.
+    medium = Medium(sound_speed_m_s=np.array(1.02 * WATER_M_S), delay_s=np.array(1e-6))
+    unknown = np.full((11, 11), np.nan)
+    slower = replace(other, medium=medium, unknowns_covariance=unknown)
+    ends = pixels[[0, 5]]
+    lateral, axial = (ends * np.asarray(whole.scale_mm_per_px) + [0.0, 4.0]).T
+    places = np.stack([lateral, 0 * lateral, axial, 1 + 0 * axial])
+    for fit in (other, slower):
+        fits = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], replace(fit, problem=None))
+        found = _of_image(fits, whole, whole.problem)
+        expected = fit.apply(ends).points
+        np.testing.assert_allclose((found[0] @ places).T[:, :3], expected, atol=1e-9)
+    first, second = (np.asarray(fit.image_to_probe) for fit in (whole, other))
+    stretch = np.asarray(other.scale_mm_per_px) / np.asarray(whole.scale_mm_per_px)
+    away = other.apply(ends).points - whole.apply(ends).points
+    apart = np.sqrt(np.mean(np.sum(away**2, axis=1)))
+    assert distance(first, second, stretch, places[[0, 2]].T, 4.0) == pytest.approx(apart, rel=1e-9)
 
 
 def test_log_density_has_the_trackers_errors_in_it(data, whole):

@@ -32,6 +32,7 @@ from jaxcal.calibration.calibrate import (
 from jaxcal.calibration.dependence import independent
 from jaxcal.data.problem import Problem, as_problem
 from jaxcal.data.recording import MINIMUM_IMAGES, Recording
+from jaxcal.diagnostics.intervals import range_of_row_zero
 from jaxcal.diagnostics.metrics import calibration_reproducibility
 from jaxcal.model.parameters import Parameters
 from jaxcal.model.residuals import measured_points, measurement_residual
@@ -69,7 +70,8 @@ class CrossValidation(eqx.Module):
         fold_cost: (n,) minimised objective of the calibration that held the image out.
         mask: (n,) 1 for used images.
         image_moved: (n,) how far leaving the image (its fold) out moves ``image_points``, as a root
-            mean square over these points, estimated pixel sizes included, mm.
+            mean square over these points, estimated pixel sizes, sound speed and delay included,
+            mm.
         image_points: (m, 2) [lateral, axial] of those points, mm: corners and middle of the box
             that the measured points fill.
     """
@@ -98,7 +100,7 @@ class Bootstrap(eqx.Module):
         spread: (6,) SD of X about the X of all images, [v, omega], mm and rad. It is computed from
             medians, so a few resamples with too few different images do not spoil it.
         reproducibility: (m,) mean distance of an image point from its mean over the resamples, mm,
-            estimated pixel sizes included.
+            estimated pixel sizes, sound speed and delay included.
         image_points: (m, 2) [lateral, axial] of those points, mm: corners and middle of the box
             that the measured points fill.
     """
@@ -163,7 +165,7 @@ def _compared(
     moved = mask[:, None] * moved
     points = _corners(problem, result)
     whole = jnp.asarray(result.image_to_probe)
-    image_moved = _apart(_with_scale(held, result), whole, points) * mask
+    image_moved = _apart(_of_image(held, result, problem), whole, points) * mask
     sd, tracker = held.sigma, held.linearisation.tracker_sd
     if tracker is not None:
         sd = jnp.hypot(sd, tracker[:, None])
@@ -248,7 +250,8 @@ def _scatter(problem: Problem, result: Calibration, fits: Calibration) -> Bootst
     moved = jnp.where(converged[:, None] > 0, jnp.abs(moved), jnp.nan)
     points = _corners(problem, result)
     # A resample that did not converge gets the X of all images, and adds nothing to the scatter.
-    transforms = jnp.where(converged[:, None, None] > 0, _with_scale(fits, result), whole)
+    found = _of_image(fits, result, problem)
+    transforms = jnp.where(converged[:, None, None] > 0, found, whole)
     share = jnp.maximum(jnp.mean(converged), 1e-9)
     return Bootstrap(
         image_to_probe=drawn,
@@ -277,18 +280,22 @@ def relative_twist(first: Float[Array, "4 4"], second: Float[Array, "4 4"]) -> F
     return jnp.concatenate([shift, turn])
 
 
-def _with_scale(fits: Calibration, result: Calibration) -> Float[Array, "k 4 4"]:
-    """X of many calibrations, scaled by their pixel sizes over those of the full calibration.
+def _of_image(fits: Calibration, result: Calibration, problem: Problem) -> Float[Array, "k 4 4"]:
+    """Transforms from the image of the full calibration, in its mm, to the probe.
 
-    It takes a point of the image, in mm of the full calibration, to the probe. (A face offset is
-    scaled together with the range; only pixels of known size have one.)
+    Another calibration has pixels of another size, another sound speed and another delay, and puts
+    the same pixel at another place z' = a (z - o) + o' of its image, with o the range of row 0.
     """
-    if fits.scale_mm_per_px is None or result.scale_mm_per_px is None:
-        return jnp.asarray(fits.image_to_probe)
-    ratio = jnp.asarray(fits.scale_mm_per_px) / jnp.asarray(result.scale_mm_per_px)
-    one = jnp.ones_like(ratio[:, 0])
-    stretch = jnp.stack([ratio[:, 0], one, ratio[:, 1], one], axis=1)
-    return jnp.asarray(fits.image_to_probe) * stretch[:, None]
+    origin, speed = range_of_row_zero(replace(result, problem=problem))
+    origins, speeds = range_of_row_zero(replace(fits, problem=problem))
+    lateral, axial = jnp.ones_like(speeds), jnp.asarray(speeds / speed)
+    if fits.scale_mm_per_px is not None and result.scale_mm_per_px is not None:
+        ratio = jnp.asarray(fits.scale_mm_per_px) / jnp.asarray(result.scale_mm_per_px)
+        lateral, axial = ratio[:, 0], axial * ratio[:, 1]
+    x = jnp.asarray(fits.image_to_probe)
+    stretch = jnp.stack([lateral, jnp.ones_like(axial), axial], axis=1)
+    shift = (origins - axial * origin)[:, None] * x[:, :3, 2]
+    return (x.at[:, :3, :3].multiply(stretch[:, None])).at[:, :3, 3].add(shift)
 
 
 def _apart(

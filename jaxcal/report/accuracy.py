@@ -285,7 +285,8 @@ def _comparison(
     mine = np.ones(2)
     if answer.scale_mm_per_px is not None:
         mine = np.asarray(answer.scale_mm_per_px) / spacing
-    apart = distance(np.asarray(answer.image_to_probe), x, scale / mine, grid)
+    face = float(np.asarray(problem.face_offset))
+    apart = distance(np.asarray(answer.image_to_probe), x, scale / mine, grid, face)
     density = found.log_density - fit.log_density
     count = int(used.sum())
     # Within a bound, offsets fit themselves: their errors are zero, and have no density.
