@@ -32,6 +32,7 @@ from jaxcal.calibration.calibrate import (
 from jaxcal.calibration.dependence import independent
 from jaxcal.data.problem import Problem, as_problem
 from jaxcal.data.recording import MINIMUM_IMAGES, Recording
+from jaxcal.diagnostics.image_errors import error_sd
 from jaxcal.diagnostics.intervals import range_of_row_zero
 from jaxcal.diagnostics.metrics import calibration_reproducibility
 from jaxcal.model.parameters import Parameters
@@ -166,9 +167,7 @@ def _compared(
     points = _corners(problem, result)
     whole = jnp.asarray(result.image_to_probe)
     image_moved = _apart(_of_image(held, result, problem), whole, points) * mask
-    sd, tracker = held.sigma, held.linearisation.tracker_sd
-    if tracker is not None:
-        sd = jnp.hypot(sd, tracker[:, None])
+    sd = jnp.asarray(error_sd(held))
     density = -0.5 * jnp.sum((errors / sd) ** 2 + jnp.log(2 * jnp.pi * sd**2), 1)
     return CrossValidation(
         residual=errors,

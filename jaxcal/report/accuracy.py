@@ -24,7 +24,7 @@ from jaxcal.data.problem import Problem
 from jaxcal.data.recording import LARGEST, Recording
 from jaxcal.design.candidates import seen_region
 from jaxcal.design.constraints import Region
-from jaxcal.diagnostics.image_errors import Unknowns
+from jaxcal.diagnostics.image_errors import Unknowns, error_sd
 from jaxcal.diagnostics.influence import (
     KINDS,
     Influence,
@@ -272,9 +272,7 @@ def _comparison(
         further["scale"] = list(scale[:, None])
     alone = map_arrays(lambda leaf: np.asarray(leaf, float)[None], problem)
     unknowns = Unknowns(x[None, :3, :3], x[None, :3, 3], point[None], further)
-    sigma, tracker = np.asarray(answer.sigma, float), answer.linearisation.tracker_sd
-    if tracker is not None:
-        sigma = np.hypot(sigma, tracker)
+    sigma = np.asarray(error_sd(answer), float)
     if not np.isfinite(sigma).all():
         return None
     fit = conventional_fit(unknowns, alone, answer.blocks, used, sigma)
