@@ -29,9 +29,10 @@ from jaxcal.diagnostics.intervals import (
 from jaxcal.model.image_points import point_jacobian
 from jaxcal.report.accuracy import FAIR_MM, GOOD_MM, settle
 from jaxcal.report.next_poses import next_poses_sentences
-from jaxcal.report.record import calibration_record
+from jaxcal.report.record import _precision, calibration_record
 from jaxcal.report.tables import calibration_table
 from jaxcal.report.verdict import headline, limits, verdict
+from jaxcal.result.calibration import Medium
 from jaxcal.result.saved import load_calibration
 from jaxcal.result.transform import ImageTransform
 
@@ -439,6 +440,32 @@ def test_test_images_that_scatter_contradict_the_error(record):
     assert changed["verdict"] == "uncertain"
     assert changed["tre"]["rms_mm"] == pytest.approx(55.7, rel=0.01)
     assert "the test images scatter by 55.70 mm, where" in " ".join(verdict(changed))
+    # Of which a tracker with errors of 20 mm explains the most.
+    changed["tracker_sd_mm"] = 20.0
+    settle(changed)
+    assert changed["tre"]["factor"] == 1.0
+
+
+def test_precision_is_that_at_the_estimated_sound_speed_and_delay():
+    recording = experiment(3, images=24, elevation_mm=1.0, test_images=6)
+    result = jaxcal.calibrate(recording, "conventional").numpy()
+    assert result.problem is not None
+    assert recording.test is not None
+    factor, delay_mm = 1.03, 0.8
+
+    def earlier(images):
+        return replace(images, measurements=images.measurements / [1.0, factor] + [0.0, delay_mm])
+
+    nominal = float(np.asarray(result.problem.nominal_sound_speed))
+    medium = Medium(
+        sound_speed_m_s=np.array(factor * nominal), delay_s=np.array(delay_mm / nominal / 1e3)
+    )
+    estimated = replace(result, problem=earlier(result.problem), medium=medium)
+    for test in (recording.test, None):
+        plain = replace(recording, test=test)
+        other = replace(recording, test=None if test is None else earlier(test))
+        expected, name = _precision(result, plain, None)
+        assert _precision(estimated, other, None) == (pytest.approx(expected, rel=1e-9), name)
 
 
 @pytest.mark.parametrize("shift_mm", [0.0, 6.0])

@@ -484,6 +484,15 @@ def flat():
     return recording, jaxcal.calibrate(recording, "conventional")
 
 
+def test_the_trackers_errors_are_those_of_further_images_too():
+    recording = jaxcal.simulate_recording(jaxcal.Protocol(images=10))
+    found = jaxcal.calibrate(recording, "conventional")
+    tracked = replace(found.linearisation, tracker_sd=np.array(4.0))
+    found = replace(found, method="joint", sigma=np.full(3, 3.0), linearisation=tracked)
+    targets = np.random.default_rng(0).uniform(20.0, 60.0, (10, 3))
+    np.testing.assert_allclose(Noise.learned(found, targets).sigma(targets), 5.0, rtol=1e-12)
+
+
 def test_a_plan_from_an_unobservable_recording_aims_at_the_unseen_direction(flat):
     recording, result = flat
     assert result.status == "unobservable"

@@ -72,6 +72,11 @@ def test_whoever_has_wrong_frames_gets_neither_poses_nor_files(slips, tmp_path):
     result = jaxcal.calibrate(recording, "conventional")
     assert result.wrong_frames is not None
     assert next_poses_record(result, recording) is None
+    # The matrix is shown, but never without the word right above it.
+    shown, word = "image_plane_to_probe (mm)", ": do not use"
+    for text in (str(result), result._repr_html_()):
+        assert text.count(shown) == text.count(shown + word) == 1
+        assert "error to expect" not in text
     with pytest.raises(jaxcal.InputError, match="must not be used"):
         result.save(tmp_path / "cal.npz")
 

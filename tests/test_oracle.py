@@ -197,19 +197,26 @@ def test_given_standard_deviations(name, row):
             np.testing.assert_allclose(answer["scale_mm_per_px"], fit.unknowns.scale, rtol=1e-9)
 
 
-@pytest.mark.parametrize(("name", "row"), [("points12", row) for row in (0, 1, 2, 3, 4, 5)])
+@pytest.mark.parametrize(
+    ("name", "row"),
+    [
+        *(("points12", row) for row in (0, 1, 2, 3, 4, 5)),
+        *(("covariances24", row) for row in (0, 1, 2, 3)),
+    ],
+)
 def test_a_tracker_that_errs(name, row):
     """Offsets as unknowns of their own; without tracker errors they go over into q_y."""
     data, tau = data_of(name, row), 0.2
-    start = least_squares.joint(data, RIGID, GIVEN, conventional(name, row).unknowns)
-    fit = least_squares.joint_explicit(data, RIGID, GIVEN, tau, start.unknowns)
+    shape = None if data.covariance is None else data.shape()
+    start = least_squares.joint(data, RIGID, GIVEN, conventional(name, row).unknowns, shape)
+    fit = least_squares.joint_explicit(data, RIGID, GIVEN, tau, start.unknowns, shape)
     whole = uncertainty.covariance(fit.jacobian, 9 + len(data))
     (answer,) = answers(name, "tracker", row)
     assert apart(answer, fit.unknowns) < AGREE
     assert answer["cost"] == pytest.approx(fit.cost, rel=1e-9)
     assert_covariances(answer, whole[:9, :9])
     assert_offsets(answer, used_images(name, row), fit.offset, np.sqrt(np.diag(whole)[9:]))
-    none = least_squares.joint_explicit(data, RIGID, GIVEN, 1e-5, start.unknowns)
+    none = least_squares.joint_explicit(data, RIGID, GIVEN, 1e-6, start.unknowns, shape)
     (eliminated, *_) = answers(name, "given", row)
     assert apart(eliminated, none.unknowns) < 1e-5
 

@@ -75,6 +75,9 @@ def test_errors_that_no_tip_in_a_dimple_has_are_told(tmp_path, capsys):
     assert found.wrong_frames is not None
     assert "too large for a tip that stays in place" in found.wrong_frames
     assert found.warnings[0] == found.wrong_frames
+    told = str(found)
+    assert told.count(found.wrong_frames) == 1
+    assert told.index("do not use: ") < told.index("tip in the tool's frame")
     path = tmp_path / "poses.txt"
     np.savetxt(path, poses.reshape(60, 16))
     assert main(["pivot", str(path), "--json"]) == 3

@@ -11,11 +11,22 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import experiment, problem, select
+from oracle.model import Data, Unknowns, errors
+from scipy.stats import norm
 
 import jaxcal
-from jaxcal.calibration.resampling import bootstrap, cross_validate, relative_twist
+from jaxcal.calibration.resampling import (
+    _compared,
+    _of_image,
+    bootstrap,
+    cross_validate,
+    relative_twist,
+)
 from jaxcal.cli.main import main
+from jaxcal.data.sound import WATER_M_S
 from jaxcal.diagnostics import metrics
+from jaxcal.model.image_points import distance
+from jaxcal.result.calibration import Medium
 
 CONVENTIONAL: dict[str, Any] = {"method": "conventional"}
 COUNT = 20
@@ -67,12 +78,15 @@ def test_a_bad_image_has_the_most_influence(data):
 
 
 def test_a_calibration_by_another_method_is_refused(data, whole):
-    """Compared with the folds, it would be taken for the influence of the images."""
+    """Compared with the folds, it would be taken for the influence of the images.
+
+    At once: 100,000 resamples would take long.
+    """
     other = replace(whole, method="alternating", prior="bounded")
     with pytest.raises(jaxcal.InputError, match=r"has method 'alternating'.* for 'conventional'"):
         cross_validate(data, folds=4, result=other, **CONVENTIONAL)
     with pytest.raises(jaxcal.InputError, match=r"has method 'alternating'.* for 'conventional'"):
-        bootstrap(data, 4, result=other, **CONVENTIONAL)
+        bootstrap(data, 100_000, result=other, **CONVENTIONAL)
 
 
 @pytest.mark.slow
@@ -105,13 +119,77 @@ def test_bootstrap_scatters_as_the_covariance_says(data, whole):
     assert float(found.reproducibility[4]) < float(np.max(found.reproducibility))
 
 
-@pytest.mark.slow
-def test_an_images_bound_is_drawn_with_it(data):
-    bound = np.linspace(0.2, 4.0, COUNT)
-    asked: dict[str, Any] = {"method": "joint", "prior": "bounded"}
-    given = bootstrap(data, 4, **asked, max_elevation=bound)
-    held = bootstrap(replace(data, max_elevation=jnp.asarray(bound)), 4, **asked)
+def test_an_images_bound_is_drawn_with_it(data, whole):
+    """As the bounds in the problem are: that of a pose is the mean of its images' bounds."""
+    poses, measurements = (
+        values.at[11].set(values[12]) for values in (data.poses, data.measurements)
+    )
+    data = replace(data, poses=poses, measurements=measurements)
+    bound = jnp.linspace(0.2, 4.0, COUNT).at[12].set(0.0)
+    asked: dict[str, Any] = {"method": "alternating"}
+    # Of the calibration of all images only the mask matters here.
+    mask = np.where(np.arange(COUNT) == 11, 0.0, 1.0)
+    result = replace(whole, method="alternating", prior="bounded", mask=mask)
+    given = bootstrap(data, 2, **asked, result=result, max_elevation=bound)
+    held = bootstrap(replace(data, max_elevation=bound), 2, **asked, result=result)
     np.testing.assert_array_equal(given.image_to_probe, held.image_to_probe)
+
+
+def test_a_pixel_has_other_places_in_the_images_of_other_calibrations(data):
+    """Pixel sizes stretch what lies above row 0 of the image, but not the range of row 0."""
+    pixels = np.asarray(data.measurements - jnp.array([0.0, 4.0])) / [0.12, 0.1]
+    images = jaxcal.make_images(
+        np.asarray(data.poses), pixels, "pixel", spacing_mm=(0.12, 0.1), face_offset_mm=4.0
+    )
+    whole, other = (
+        jaxcal.calibrate(
+            jaxcal.Problem.from_recording(replace(images, mask=np.arange(COUNT) >= first)),
+            method="conventional",
+            estimate="scale",
+        )
+        for first in (0, 8)
+    )
+    assert whole.problem is not None
+    # As if the sound speed and the delay had been estimated, too.
+    medium = Medium(sound_speed_m_s=np.array(1.02 * WATER_M_S), delay_s=np.array(1e-6))
+    unknown = np.full((11, 11), np.nan)
+    slower = replace(other, medium=medium, unknowns_covariance=unknown)
+    ends = pixels[[0, 5]]
+    lateral, axial = (ends * np.asarray(whole.scale_mm_per_px) + [0.0, 4.0]).T
+    places = np.stack([lateral, 0 * lateral, axial, 1 + 0 * axial])
+    for fit in (other, slower):
+        fits = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], replace(fit, problem=None))
+        found = _of_image(fits, whole, whole.problem)
+        expected = fit.apply(ends).points
+        np.testing.assert_allclose((found[0] @ places).T[:, :3], expected, atol=1e-9)
+    first, second = (np.asarray(fit.image_to_probe) for fit in (whole, other))
+    stretch = np.asarray(other.scale_mm_per_px) / np.asarray(whole.scale_mm_per_px)
+    away = other.apply(ends).points - whole.apply(ends).points
+    apart = np.sqrt(np.mean(np.sum(away**2, axis=1)))
+    assert distance(first, second, stretch, places[[0, 2]].T, 4.0) == pytest.approx(apart, rel=1e-9)
+
+
+def test_log_density_has_the_trackers_errors_in_it(data, whole):
+    sigma, tau, fold = np.array([0.3, 0.2, 1.0]), 0.5, np.arange(COUNT) % 2
+    each = [
+        jaxcal.calibrate(replace(data, mask=jnp.asarray(fold != k, float)), **CONVENTIONAL)
+        for k in range(2)
+    ]
+    fits = jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
+    tracked = replace(fits.linearisation, tracker_sd=jnp.full(2, tau))
+    fits = replace(fits, sigma=jnp.tile(sigma, (2, 1)), linearisation=tracked)
+    found = _compared(data, whole, fits, jnp.asarray(fold))
+    poses, x = np.asarray(data.poses), np.asarray(fits.image_to_probe)
+    for k in range(2):
+        held = Data(
+            poses[fold == k, :3, :3],
+            poses[fold == k, :3, 3],
+            np.asarray(data.measurements)[fold == k],
+            np.ones(2),
+        )
+        there = Unknowns(x[k, :3, :3], x[k, :3, 3], np.asarray(fits.point)[k], np.ones(2))
+        expected = norm.logpdf(errors(held, there), scale=np.hypot(sigma, tau)).sum(axis=1)
+        np.testing.assert_allclose(found.log_density[fold == k], expected, rtol=1e-9)
 
 
 @pytest.mark.slow

@@ -131,7 +131,8 @@ def calibrate(
         prior: distribution of the offsets in the joint method. ``auto``: SDs are estimated, and the
             answer is an average over several distributions of the offsets, with or without a mean,
             and over noise models, weighted by their probability (:mod:`jaxcal.solvers.auto`).
-            ``uniform``: the same, but only with uniform distributions of the offsets.
+            ``uniform``: the same, but only with uniform distributions of the offsets; where offsets
+            have no sharp limits, the stated error is then too small.
             ``gaussian``: offsets and errors are Gaussian, with the SDs of ``sigma`` or, without it,
             estimated by REML. ``bounded``: |y_i| <= max_elevation with equal weights, the
             alternation's objective. With given ``sigma``, ``auto`` is ``gaussian``.

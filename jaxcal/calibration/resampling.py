@@ -22,10 +22,18 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
 from jaxcal import InputError
-from jaxcal.calibration.calibrate import calibrate, calibrate_batch
+from jaxcal.calibration.calibrate import (
+    Request,
+    calibrate,
+    calibrate_batch,
+    prepare,
+    unknown_names,
+)
 from jaxcal.calibration.dependence import independent
 from jaxcal.data.problem import Problem, as_problem
 from jaxcal.data.recording import MINIMUM_IMAGES, Recording
+from jaxcal.diagnostics.image_errors import error_sd
+from jaxcal.diagnostics.intervals import range_of_row_zero
 from jaxcal.diagnostics.metrics import calibration_reproducibility
 from jaxcal.model.parameters import Parameters
 from jaxcal.model.residuals import measured_points, measurement_residual
@@ -36,6 +44,7 @@ from jaxcal.runtime.given_values import LARGEST_SEED, check_key, check_made, who
 from jaxcal.runtime.messages import shown
 from jaxcal.runtime.precision import in_own_modes
 from jaxcal.solvers import dense
+from jaxcal.solvers.plan import SolvePlan
 
 LARGEST_RESAMPLES = 100_000
 
@@ -62,7 +71,8 @@ class CrossValidation(eqx.Module):
         fold_cost: (n,) minimised objective of the calibration that held the image out.
         mask: (n,) 1 for used images.
         image_moved: (n,) how far leaving the image (its fold) out moves ``image_points``, as a root
-            mean square over these points, estimated pixel sizes included, mm.
+            mean square over these points, estimated pixel sizes, sound speed and delay included,
+            mm.
         image_points: (m, 2) [lateral, axial] of those points, mm: corners and middle of the box
             that the measured points fill.
     """
@@ -91,7 +101,7 @@ class Bootstrap(eqx.Module):
         spread: (6,) SD of X about the X of all images, [v, omega], mm and rad. It is computed from
             medians, so a few resamples with too few different images do not spoil it.
         reproducibility: (m,) mean distance of an image point from its mean over the resamples, mm,
-            estimated pixel sizes included.
+            estimated pixel sizes, sound speed and delay included.
         image_points: (m, 2) [lateral, axial] of those points, mm: corners and middle of the box
             that the measured points fill.
     """
@@ -125,18 +135,15 @@ def cross_validate(
         InputError: too few images, folds that are not from 2 to the number of images, options that
             contradict each other, or a result by another method than they ask for.
     """
-    problem = _one_problem(problem, arguments, "jaxcal.cross_validate")
+    problem, plan = _one_problem(problem, arguments, "jaxcal.cross_validate")
     count = problem.images
     folds = count if folds is None else whole_number("folds", folds, 2, count)
-    result = _of_all_images(problem, result, arguments)
+    result = _of_all_images(problem, result, plan, arguments)
     problem = replace(problem, mask=jnp.asarray(result.mask, problem.mask.dtype))
     fold = np.arange(count) % folds
     rest = jnp.asarray(fold[None, :] != np.arange(folds)[:, None], problem.mask.dtype)
     _check_left(problem.mask, rest)
-    # Outliers were found with all images, so no fold looks for them again.
-    options: dict[str, Any] = {**arguments, "robust": False}
-    fits = calibrate_batch(_many(problem, problem.mask * rest), **options)
-    _check_alike(result, fits)
+    fits = calibrate_batch(_many(problem, problem.mask * rest), **_of_each(arguments))
     return _compared(problem, result, fits, fold)
 
 
@@ -159,10 +166,8 @@ def _compared(
     moved = mask[:, None] * moved
     points = _corners(problem, result)
     whole = jnp.asarray(result.image_to_probe)
-    image_moved = _apart(_with_scale(held, result), whole, points) * mask
-    sd, tracker = held.sigma, held.linearisation.tracker_sd
-    if tracker is not None:
-        sd = jnp.hypot(sd, tracker[:, None])
+    image_moved = _apart(_of_image(held, result, problem), whole, points) * mask
+    sd = jnp.asarray(error_sd(held))
     density = -0.5 * jnp.sum((errors / sd) ** 2 + jnp.log(2 * jnp.pi * sd**2), 1)
     return CrossValidation(
         residual=errors,
@@ -204,24 +209,19 @@ def bootstrap(
         InputError: fewer than 2 resamples, options that contradict each other, or a result by
             another method than they ask for.
     """
-    problem = _one_problem(problem, arguments, "jaxcal.bootstrap")
+    problem, plan = _one_problem(problem, arguments, "jaxcal.bootstrap")
     resamples = whole_number("resamples", resamples, 2, LARGEST_RESAMPLES)
     if isinstance(key, jax.Array):
         check_key("key", key)
         root = key
     else:
         root = jax.random.key(whole_number("key", key, 0, LARGEST_SEED))
-    result = _of_all_images(problem, result, arguments)
+    result = _of_all_images(problem, result, plan, arguments)
     mask = jnp.asarray(result.mask, problem.mask.dtype)
     problem = replace(problem, mask=mask)
     rows = _rows(root, mask, resamples)
     # Each draw has as many images as were used, since the mask leaves out the other rows.
-    options: dict[str, Any] = {**arguments, "robust": False}
-    bound: Any = options.get("max_elevation")
-    if np.shape(bound) == (problem.images,):
-        options["max_elevation"] = jnp.asarray(bound)[rows]  # drawn with its image
-    fits = calibrate_batch(_drawn(problem, rows, mask), **options)
-    _check_alike(result, fits)
+    fits = calibrate_batch(_drawn(problem, rows, mask), **_of_each(arguments))
     return _scatter(problem, result, fits)
 
 
@@ -249,7 +249,8 @@ def _scatter(problem: Problem, result: Calibration, fits: Calibration) -> Bootst
     moved = jnp.where(converged[:, None] > 0, jnp.abs(moved), jnp.nan)
     points = _corners(problem, result)
     # A resample that did not converge gets the X of all images, and adds nothing to the scatter.
-    transforms = jnp.where(converged[:, None, None] > 0, _with_scale(fits, result), whole)
+    found = _of_image(fits, result, problem)
+    transforms = jnp.where(converged[:, None, None] > 0, found, whole)
     share = jnp.maximum(jnp.mean(converged), 1e-9)
     return Bootstrap(
         image_to_probe=drawn,
@@ -278,18 +279,22 @@ def relative_twist(first: Float[Array, "4 4"], second: Float[Array, "4 4"]) -> F
     return jnp.concatenate([shift, turn])
 
 
-def _with_scale(fits: Calibration, result: Calibration) -> Float[Array, "k 4 4"]:
-    """X of many calibrations, scaled by their pixel sizes over those of the full calibration.
+def _of_image(fits: Calibration, result: Calibration, problem: Problem) -> Float[Array, "k 4 4"]:
+    """Transforms from the image of the full calibration, in its mm, to the probe.
 
-    It takes a point of the image, in mm of the full calibration, to the probe. (A face offset is
-    scaled together with the range; only pixels of known size have one.)
+    Another calibration has pixels of another size, another sound speed and another delay, and puts
+    the same pixel at another place z' = a (z - o) + o' of its image, with o the range of row 0.
     """
-    if fits.scale_mm_per_px is None or result.scale_mm_per_px is None:
-        return jnp.asarray(fits.image_to_probe)
-    ratio = jnp.asarray(fits.scale_mm_per_px) / jnp.asarray(result.scale_mm_per_px)
-    one = jnp.ones_like(ratio[:, 0])
-    stretch = jnp.stack([ratio[:, 0], one, ratio[:, 1], one], axis=1)
-    return jnp.asarray(fits.image_to_probe) * stretch[:, None]
+    origin, speed = range_of_row_zero(replace(result, problem=problem))
+    origins, speeds = range_of_row_zero(replace(fits, problem=problem))
+    lateral, axial = jnp.ones_like(speeds), jnp.asarray(speeds / speed)
+    if fits.scale_mm_per_px is not None and result.scale_mm_per_px is not None:
+        ratio = jnp.asarray(fits.scale_mm_per_px) / jnp.asarray(result.scale_mm_per_px)
+        lateral, axial = ratio[:, 0], axial * ratio[:, 1]
+    x = jnp.asarray(fits.image_to_probe)
+    stretch = jnp.stack([lateral, jnp.ones_like(axial), axial], axis=1)
+    shift = (origins - axial * origin)[:, None] * x[:, :3, 2]
+    return (x.at[:, :3, :3].multiply(stretch[:, None])).at[:, :3, 3].add(shift)
 
 
 def _apart(
@@ -303,41 +308,59 @@ def _apart(
 
 
 def _of_all_images(
-    problem: Problem, result: Calibration | None, arguments: dict[str, Any]
+    problem: Problem, result: Calibration | None, plan: SolvePlan, arguments: dict[str, Any]
 ) -> Calibration:
     """The calibration of all images: the caller's, checked, or a new one."""
     if result is None:
-        return calibrate(problem, **arguments)
+        return calibrate(problem, **_of_one(arguments))
     check_made("result", result, Calibration, "jaxcal.calibrate")
     if np.shape(result.mask) != (problem.images,):
         raise InputError(
             f"result must be the calibration of these {problem.images} images; its mask has shape "
             f"{np.shape(result.mask)}"
         )
-    return result
-
-
-def _check_alike(result: Calibration, fits: Calibration) -> None:
-    """Refuse the caller's calibration where it was made in another way than the fits."""
-    for name in ("method", "prior", "data", "blocks"):
-        given, own = getattr(result, name), getattr(fits, name)
+    for name, own in (
+        ("method", plan.method),
+        ("prior", plan.reported_prior),
+        ("data", "channels" if plan.channels else "points"),
+        ("blocks", plan.blocks),
+    ):
+        given = getattr(result, name)
         if given != own:
             raise InputError(
                 f"result has {name} {shown(given)}, and the arguments ask for {shown(own)}: give "
                 "those that the result was made with, or no result"
             )
+    return result
 
 
-def _one_problem(problem: Problem | Recording, arguments: dict[str, Any], name: str) -> Problem:
-    """One problem; if its values are concrete, every pose counts once."""
+def _of_one(arguments: dict[str, Any]) -> dict[str, Any]:
+    """The arguments without the bound on the offsets, which is the problem's now."""
+    return {name: value for name, value in arguments.items() if name != "max_elevation"}
+
+
+def _of_each(arguments: dict[str, Any]) -> dict[str, Any]:
+    """The same for parts of the problem: outliers were found with all images."""
+    return {**_of_one(arguments), "robust": False}
+
+
+def _one_problem(
+    problem: Problem | Recording, arguments: dict[str, Any], name: str
+) -> tuple[Problem, SolvePlan]:
+    """One problem with its bounds, and how it is solved.
+
+    If its values are concrete, every pose counts once.
+    """
     problem = as_problem(problem, name)
     if problem.batch_shape:
         raise InputError("resampling takes one problem at a time, not a batch")
+    estimate = unknown_names(arguments.get("estimate", ()))
+    problem, plan, _ = prepare(problem, Request(**{**arguments, "estimate": estimate}), name)
     if any(is_traced(leaf) for leaf in jax.tree.leaves(problem)):
-        return problem
-    alone = independent(problem, arguments.get("estimate", ()))[0]
+        return problem, plan
+    alone = independent(problem, estimate)[0]
     # If JAX's 64 bits are off, a problem holds numpy arrays, which a traced index cannot index.
-    return jax.tree.map(jnp.asarray, alone)
+    return jax.tree.map(jnp.asarray, alone), plan
 
 
 def _check_left(mask: Array, rest: Array) -> None:

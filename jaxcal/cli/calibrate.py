@@ -56,7 +56,8 @@ EXPORTS: tuple[SaveFormat, ...] = ("plus", "slicer", "itk", "ros", "tusrec", "nu
     default="auto",
     show_default=True,
     help="Distribution of the offsets in the joint method; auto: an average over several, "
-    "weighted by their probability.",
+    "weighted by their probability; uniform: only if something limits the offsets on both sides "
+    "(otherwise the stated error is too small).",
 )
 @click.option(
     "--max-elevation",

@@ -16,6 +16,7 @@ import numpy as np
 
 from jaxcal import InputError
 from jaxcal.data.probe import Probe, check_probe
+from jaxcal.diagnostics.image_errors import error_sd
 from jaxcal.diagnostics.sd_by_place import basis_at, log_sd_slopes
 from jaxcal.runtime.array_types import Bool, Float
 from jaxcal.runtime.arrays import is_traced
@@ -152,7 +153,7 @@ class Noise:
         if targets.ndim != 2 or targets.shape[1] != 3:
             raise InputError(f"targets must have shape (n, 3), not {targets.shape}")
         answer = result.numpy()
-        sigma = np.maximum(np.asarray(answer.sigma, float), _LEAST_SD_MM)
+        sigma = np.maximum(np.asarray(error_sd(answer), float), _LEAST_SD_MM)
         if not np.isfinite(sigma).all():
             raise InputError("this calibration has no SDs: plan with a noise model of your own")
         used = used_images(result, len(targets))

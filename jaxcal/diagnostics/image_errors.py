@@ -20,7 +20,8 @@ import numpy as np
 
 from jaxcal.model import unknowns as model
 from jaxcal.model.unknowns import RIGID, TINY, further_derivatives, size, split_further
-from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.array_types import AnyArray, Float
+from jaxcal.runtime.arrays import array_module
 
 if TYPE_CHECKING:
     from jaxcal.data.problem import Problem
@@ -250,6 +251,14 @@ class Whitened:
             own = self.offset**2 / self.weight[..., None]
         flat = rows.reshape(len(rows), -1, rows.shape[-1])
         return quadratic(flat, inverse).reshape(rows.shape[:-1]) + own
+
+
+def error_sd(answer: Calibration) -> Float[AnyArray, "*batch 3"]:
+    """SDs of the images' lateral, range and elevational errors, those of the tracker included."""
+    tracker = answer.linearisation.tracker_sd
+    if tracker is None:
+        return answer.sigma
+    return array_module(answer.sigma).hypot(answer.sigma, tracker[..., None])
 
 
 def own_covariance(answer: Calibration, seen: ImageErrors) -> Float[Array, "k n 2 2"] | None:

@@ -87,5 +87,9 @@ def _apart(
     """How far apart two fits put the image's pixels on the probe, root mean square, mm."""
     stretch = _pixel_size(second, problem) / _pixel_size(first, problem)
     return distance(
-        np.asarray(first.image_to_probe), np.asarray(second.image_to_probe), stretch, grid
+        np.asarray(first.image_to_probe),
+        np.asarray(second.image_to_probe),
+        stretch,
+        grid,
+        float(np.asarray(problem.face_offset)),
     )

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxcal.diagnostics.image_errors import ImageErrors, Whitened, motion, quadratic
+from jaxcal.diagnostics.image_errors import ImageErrors, Whitened, error_sd, motion, quadratic
 from jaxcal.diagnostics.sd_by_place import relative_sd
 from jaxcal.diagnostics.uncertainty import Uncertainty, inverses
 from jaxcal.model.thresholds import CUT, FEW_IMAGES, FEWEST_IMAGES, MAD, RELATIVE_FLOOR
@@ -263,7 +263,7 @@ def gains(answer: Calibration, seen: ImageErrors, uncertainty: Uncertainty) -> F
     ):
         errors[..., 0] -= lateral * step[:, column, None]
         errors[..., 1] -= distance * step[:, column, None]
-    sigma = np.maximum(np.asarray(answer.sigma), 1e-9)[:, None]
+    sigma = np.maximum(np.asarray(error_sd(answer)), 1e-9)[:, None]
     noticed = np.sqrt(np.sum((errors / sigma) ** 2, axis=2))
     return noticed.reshape(-1, 5, 2).max(axis=2)
 

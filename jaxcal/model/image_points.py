@@ -67,6 +67,7 @@ def distance(
     second: Float[np.ndarray, "4 4"],
     stretch: Float[np.ndarray, " 2"],
     grid: Float[np.ndarray, "m 2"],
+    face_mm: float,
 ) -> float:
     """How far apart two X put image points, root mean square, mm.
 
@@ -75,8 +76,11 @@ def distance(
         second: another one.
         stretch: size of the second image's pixels over that of the first's, [lateral, axial].
         grid: [lateral, axial] of the points in the first image, mm.
+        face_mm: range of pixel row 0.
     """
-    there = np.stack([grid[:, 0], 0 * grid[:, 0], grid[:, 1], np.ones(len(grid))])
-    larger = np.array([stretch[0], 1.0, stretch[1], 1.0])[:, None]
-    moved = (second @ (larger * there) - first @ there)[:3]
+    zero, one = np.zeros(len(grid)), np.ones(len(grid))
+    there = np.stack([grid[:, 0], zero, grid[:, 1], one])
+    axial = face_mm + stretch[1] * (grid[:, 1] - face_mm)
+    other = np.stack([stretch[0] * grid[:, 0], zero, axial, one])
+    moved = (second @ other - first @ there)[:3]
     return math.sqrt(float(np.mean(np.sum(moved**2, axis=0))))

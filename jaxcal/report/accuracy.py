@@ -24,7 +24,7 @@ from jaxcal.data.problem import Problem
 from jaxcal.data.recording import LARGEST, Recording
 from jaxcal.design.candidates import seen_region
 from jaxcal.design.constraints import Region
-from jaxcal.diagnostics.image_errors import Unknowns
+from jaxcal.diagnostics.image_errors import Unknowns, error_sd
 from jaxcal.diagnostics.influence import (
     KINDS,
     Influence,
@@ -274,9 +274,7 @@ def _comparison(
         further["scale"] = list(scale[:, None])
     alone = map_arrays(lambda leaf: np.asarray(leaf, float)[None], problem)
     unknowns = Unknowns(x[None, :3, :3], x[None, :3, 3], point[None], further)
-    sigma, tracker = np.asarray(answer.sigma, float), answer.linearisation.tracker_sd
-    if tracker is not None:
-        sigma = np.hypot(sigma, tracker)
+    sigma = np.asarray(error_sd(answer), float)
     if not np.isfinite(sigma).all():
         return None
     fit = conventional_fit(unknowns, alone, answer.blocks, used, sigma)
@@ -287,7 +285,8 @@ def _comparison(
     mine = np.ones(2)
     if answer.scale_mm_per_px is not None:
         mine = np.asarray(answer.scale_mm_per_px) / spacing
-    apart = distance(np.asarray(answer.image_to_probe), x, scale / mine, grid)
+    face = float(np.asarray(problem.face_offset))
+    apart = distance(np.asarray(answer.image_to_probe), x, scale / mine, grid, face)
     density = found.log_density - fit.log_density
     count = int(used.sum())
     # Within a bound, offsets fit themselves: their errors are zero, and have no density.

@@ -37,6 +37,12 @@ _WAYS = {"lateral": "sideways", "range": "in depth"}
 """Errors within the image, in the order of the residuals, and in words."""
 
 
+def _sd(record: dict[str, Any], kind: str) -> float | None:
+    """SD of an image's errors of one kind, those of the tracker included, mm."""
+    size = record[f"sigma_{kind}_mm"]
+    return None if size is None else math.hypot(size, record["tracker_sd_mm"] or 0.0)
+
+
 def contradictions(record: dict[str, Any]) -> list[tuple[float, str]]:
     """How many times as large as stated each contradiction makes the error, and its words.
 
@@ -89,8 +95,7 @@ def _from_test_images(record: dict[str, Any]) -> list[tuple[float, str]]:
     found, stated = record["reconstruction_precision_mm"], record["tre"]["stated_mm"]
     if record["reconstruction_precision_set"] != "test" or found is None or not stated:
         return []
-    names = ("sigma_lateral_mm", "sigma_range_mm", "sigma_elevation_mm")
-    errors = [record[name] or 0.0 for name in names]
+    errors = [_sd(record, kind) or 0.0 for kind in (*_WAYS, "elevation")]
     # Poses that turn the image see its error twice as large.
     expected = math.hypot(*errors, 2 * stated)
     if found <= TEST_TIMES * expected:
@@ -110,7 +115,7 @@ def _from_slow_changes(record: dict[str, Any]) -> list[tuple[float, str]]:
     stated, scores = record["tre"]["stated_mm"], record["noise_model"]["scores"]["drift"]
     found: list[tuple[float, str]] = []
     for score, (kind, name) in zip(scores[:2], _WAYS.items(), strict=True):
-        size = record[f"sigma_{kind}_mm"]
+        size = _sd(record, kind)
         if score is None or not size or not stated or score <= DRIFT_SCORE:
             continue
         slow = size * math.sqrt(min(score / math.sqrt(record["images_used"] - 1), 1.0))
@@ -162,7 +167,7 @@ def _from_groups(record: dict[str, Any]) -> list[tuple[float, str]]:
     scores, kurtosis = model["scores"]["tails"], model["kurtosis"]
     found: list[tuple[float, str]] = []
     for k, (kind, name) in enumerate(_WAYS.items()):
-        size = record[f"sigma_{kind}_mm"]
+        size = _sd(record, kind)
         if stated and size and in_two_groups(scores[k], kurtosis[k]):
             words = f"the points lie in two groups, about {2 * size:.1f} mm apart {name}"
             found.append((math.hypot(1.0, size / stated), words))

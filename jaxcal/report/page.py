@@ -38,6 +38,7 @@ from jaxcal.report.verdict import (
     length_form,
     limits,
     scatter,
+    verdict_word,
     where,
     why_larger,
 )
@@ -208,7 +209,6 @@ def _table(rows: Iterable[Sequence[str]], head: Sequence[str] = (), words: int =
 
 def _head(record: dict[str, Any]) -> str:
     tre = record["tre"]
-    word = record["verdict"] or headline(record).split(":")[0].lower()
     kind = escape(record["verdict"] or "uncertain")
     number = ""
     if _usable(record) and tre is not None and tre.get("rms_mm") is not None:
@@ -228,7 +228,8 @@ def _head(record: dict[str, Any]) -> str:
         f'<p class="soft">{escape(record["source"])}: {record["images_used"]} images used of '
         f"{record['images']}; method {escape(record['method'] + prior)}; "
         f"jaxcal {escape(record['jaxcal_version'])}</p></header>"
-        f'<div class="verdict {kind}"><div class="word">{escape(word)}</div>{number}</div>'
+        f'<div class="verdict {kind}"><div class="word">{escape(verdict_word(record))}</div>'
+        f"{number}</div>"
         f"{_paragraphs(said)}"
     )
 

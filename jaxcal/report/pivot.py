@@ -46,6 +46,9 @@ def pivot_lines(record: dict[str, Any]) -> list[str]:
         return ", ".join("-" if value is None else f"{value:.3f}" for value in record[name])
 
     lines = [f"{record['status']}: {record['poses_used']} of {record['poses']} poses used"]
+    wrong = record["wrong_frames"]
+    if wrong:
+        lines.append(f"do not use: {wrong}")
     if record["status"] != "failed":
         lines.append(f"tip in the tool's frame (mm): {three('tip_mm')}")
         lines.append(f"pivot point in the tracker's frame (mm): {three('point_mm')}")
@@ -55,4 +58,4 @@ def pivot_lines(record: dict[str, Any]) -> list[str]:
         lines.append("SD of the tip (mm): " + ", ".join(f"{value:.3f}" for value in spread))
     if record["repeated"]:
         lines.append(f"{record['repeated']} poses repeat an earlier one exactly and are not used")
-    return [*lines, *(f"- {text}" for text in record["warnings"])]
+    return [*lines, *(f"- {text}" for text in record["warnings"] if text != wrong)]

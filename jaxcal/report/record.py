@@ -11,6 +11,7 @@ import jaxcal
 from jaxcal import InputError
 from jaxcal.data.poses import rotation_angle
 from jaxcal.data.recording import Images, Recording, Truth
+from jaxcal.diagnostics.intervals import range_of_row_zero
 from jaxcal.diagnostics.law_words import offset_law
 from jaxcal.diagnostics.metrics import reconstruction_precision
 from jaxcal.diagnostics.misfits import noise_model
@@ -101,6 +102,7 @@ def calibration_record(
         "sigma_lateral_mm": answer.sigma[0],
         "sigma_range_mm": answer.sigma[1],
         "sigma_elevation_mm": answer.sigma[2],
+        "tracker_sd_mm": answer.linearisation.tracker_sd,
         "covariance": answer.covariance if known else None,
         "image_unknowns": tangent_names(transform.unknowns),
         "image_covariance": full[rows[:, None], rows] if known else None,
@@ -215,11 +217,15 @@ def _precision(result: Calibration, images: Images) -> float | None:
 
 
 def _points_mm(images: Images, result: Calibration) -> Float[np.ndarray, "n 2"]:
-    """[lateral, range] in mm."""
-    if images.kind != "pixel":
-        return images.measurements
-    # An estimated scale replaces any given one; if it is not estimated, each set uses its own.
-    scale = result.scale_mm_per_px
-    if images.spacing_mm is not None and "scale" not in result.blocks:
-        scale = images.spacing_mm
-    return images.measurements * np.asarray(scale) + [0.0, images.face_offset_mm]
+    """[lateral, range] in mm, at the pixel sizes, sound speed and delay of the calibration."""
+    scale = np.ones(2)
+    if images.kind == "pixel":
+        # An estimated scale replaces any given one; if it is not estimated, each set uses its own.
+        scale = result.scale_mm_per_px
+        if images.spacing_mm is not None and "scale" not in result.blocks:
+            scale = images.spacing_mm
+    points = images.measurements * np.asarray(scale) + [0.0, images.face_offset_mm]
+    # Of the calibration's images, whose face offset may be another one.
+    origin, factor = map(float, range_of_row_zero(result))
+    face = 0.0 if result.problem is None else float(np.asarray(result.problem.face_offset))
+    return points * [1.0, factor] + [0.0, origin - factor * face]

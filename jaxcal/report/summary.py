@@ -97,12 +97,12 @@ def batch_text(calibration: Calibration) -> str:
 def html_of(calibration: Calibration) -> str:
     """Verdict, error map and numbers for a notebook, without script and with their own styles."""
     from jaxcal.report import svg
-    from jaxcal.report.verdict import verdict
+    from jaxcal.report.verdict import title_of_transform, verdict
 
     record = record_of(calibration)
     lines = verdict(record)
     drawn, tre = "", record["tre"]
-    if tre is not None and tre.get("factor") is not None:
+    if not record["wrong_frames"] and tre is not None and tre.get("factor") is not None:
         answer, mapped = calibration.numpy(), tre["map"]
         images = recording_of(calibration).calibration
         used = images.poses[np.asarray(answer.mask) > 0]
@@ -122,8 +122,8 @@ def html_of(calibration: Calibration) -> str:
     return (
         "<style>.jaxcal{--text:currentColor;--line:#888;--grid:#8884;max-width:46em}"
         ".jaxcal svg{max-width:26em;width:100%}.jaxcal svg text{fill:currentColor;font-size:10px}"
-        f"</style><div class='jaxcal'>{drawn}{items}<table><caption>image_plane_to_probe (mm)"
-        f"</caption>{matrix}</table></div>"
+        f"</style><div class='jaxcal'>{drawn}{items}<table><caption>"
+        f"{escape(title_of_transform(record))}</caption>{matrix}</table></div>"
     )
 
 

@@ -9,14 +9,14 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 
 from jaxcal.report.certified import certificate_words
-from jaxcal.report.verdict import spread_of_transform
+from jaxcal.report.verdict import spread_of_transform, title_of_transform
 
 _UNKNOWN = "-"
 
 
 def calibration_table(record: dict[str, Any]) -> RenderableType:
     """One calibration: transform, target, errors and quality."""
-    transform = Table(title="image_plane_to_probe (mm)", box=box.SIMPLE, show_header=False)
+    transform = Table(title=title_of_transform(record), box=box.SIMPLE, show_header=False)
     for row in record["image_plane_to_probe"]:
         transform.add_row(*(_number(value, ".6f") for value in row))
     for _ in range(4):
@@ -128,9 +128,9 @@ def _facts(record: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def _accuracy(record: dict[str, Any]) -> list[tuple[str, str]]:
-    """The error to expect, over the image and at points."""
+    """The error to expect, over the image and at points; with wrong frames it is not known."""
     tre = record.get("tre")
-    if tre is None or tre.get("rms_mm") is None:
+    if record["wrong_frames"] or tre is None or tre.get("rms_mm") is None:
         return []
 
     def shown(error: float | None, interval: list[float | None]) -> str:

@@ -72,6 +72,16 @@ def headline(record: dict[str, Any]) -> str:
     )
 
 
+def verdict_word(record: dict[str, Any]) -> str:
+    """Good, fair or uncertain, or that the calibration must not be used, in small letters."""
+    return record["verdict"] or headline(record).split(":")[0].lower()
+
+
+def title_of_transform(record: dict[str, Any]) -> str:
+    """What stands over X wherever it is printed; that it must not be used, if so."""
+    return "image_plane_to_probe (mm)" + ("" if record["verdict"] else f": {verdict_word(record)}")
+
+
 def length_form(value: float) -> str:
     """The format of a length in mm: hundredths; tenths from 10 mm on; more digits near zero."""
     return ".1f" if value >= 10 else ".2f" if value >= 0.0095 else ".4f"

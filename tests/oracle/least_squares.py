@@ -8,7 +8,8 @@ gradient, with second derivatives from its differences. The objectives:
   decorrelated where an image has a covariance of its own;
 - joint, explicit: with an offset y_i of the target and a tracker error of SD tau on each axis, the
   squares of (q_x - x) / hypot(s1, tau), (hypot(y, q_z) - r) / hypot(s2, tau), (y - q_y) / tau and
-  y / s3 (as tau goes to zero y becomes q_y, and the eliminated form is left);
+  y / s3 (as tau goes to zero y becomes q_y, and the eliminated form is left); the first two are
+  decorrelated by an image's own covariance plus tau^2 I, if it has one;
 - bounded: sum |q - p(y)|^2 with |y_i| <= m_i: a minimum has vanishing derivatives by everything
   that is free, and by an offset on its bound one that pushes it outwards (KKT).
 """
@@ -222,22 +223,26 @@ def _newton(
 
 
 def joint_explicit(
-    data: Data, blocks: tuple[str, ...], sigma: np.ndarray, tracker_sd: float, start: Unknowns
+    data: Data,
+    blocks: tuple[str, ...],
+    sigma: np.ndarray,
+    tracker_sd: float,
+    start: Unknowns,
+    shape: np.ndarray | None = None,
 ) -> ExplicitFit:
     """Given SDs and a tracker that errs: all offsets of the target are unknowns."""
     tau = tracker_sd
+    shape = np.tile(np.eye(2), (len(data), 1, 1)) if shape is None else shape
+    # The measurement's own covariance, and the tracker's.
+    covariance = np.outer(sigma[:2], sigma[:2]) * shape + tau**2 * np.eye(2)
+    whitening = np.linalg.inv(np.linalg.cholesky(covariance))
 
     def residual(u: Unknowns, y: np.ndarray) -> np.ndarray:
         q = target(data, u)
         lateral, distance = points(data, u)
-        return np.stack(
-            [
-                (q[:, 0] - lateral) / np.hypot(sigma[0], tau),
-                (np.sqrt(y**2 + q[:, 2] ** 2) - distance) / np.hypot(sigma[1], tau),
-                (y - q[:, 1]) / tau,
-                y / sigma[2],
-            ]
-        )
+        away = np.stack([q[:, 0] - lateral, np.sqrt(y**2 + q[:, 2] ** 2) - distance], axis=1)
+        both = np.einsum("nij,nj->in", whitening, away)
+        return np.stack([*both, (y - q[:, 1]) / tau, y / sigma[2]])
 
     u, y = start, target(data, start)[:, 1].real / (1 + (tau / sigma[2]) ** 2)
     everything = np.ones(len(data), bool)
