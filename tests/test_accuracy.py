@@ -461,11 +461,9 @@ def test_precision_is_that_at_the_estimated_sound_speed_and_delay():
         sound_speed_m_s=np.array(factor * nominal), delay_s=np.array(delay_mm / nominal / 1e3)
     )
     estimated = replace(result, problem=earlier(result.problem), medium=medium)
-    for test in (recording.test, None):
-        plain = replace(recording, test=test)
-        other = replace(recording, test=None if test is None else earlier(test))
-        expected, name = _precision(result, plain, None)
-        assert _precision(estimated, other, None) == (pytest.approx(expected, rel=1e-9), name)
+    for images in (recording.test, recording.calibration):
+        expected = _precision(result, images)
+        assert _precision(estimated, earlier(images)) == pytest.approx(expected, rel=1e-9)
 
 
 @pytest.mark.parametrize("shift_mm", [0.0, 6.0])

@@ -11,7 +11,7 @@ arrays (and a key), which work under jit.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from typing import Any
 
@@ -354,6 +354,8 @@ def _one_problem(
     problem = as_problem(problem, name)
     if problem.batch_shape:
         raise InputError("resampling takes one problem at a time, not a batch")
+    for argument in arguments.keys() - {field.name for field in fields(Request)}:
+        raise TypeError(f"{name}() got an unexpected keyword argument {argument!r}")
     estimate = unknown_names(arguments.get("estimate", ()))
     problem, plan, _ = prepare(problem, Request(**{**arguments, "estimate": estimate}), name)
     if any(is_traced(leaf) for leaf in jax.tree.leaves(problem)):
