@@ -27,6 +27,7 @@ import jax  # noqa: E402
 import numpy as np  # noqa: E402
 
 from golden import corpus  # noqa: E402
+from jaxcal.runtime import executables  # noqa: E402
 
 Task = tuple[str, str, str]
 """Family, call, road; the road ``gradient`` is that of the derivatives."""
@@ -66,6 +67,7 @@ def check(task: Task) -> tuple[Task, list[str], bool, float]:
         recorded = answers[call_name, road]
         lines, passes = compare(family, recorded, corpus.compute(family, call, road), call, road)
     jax.clear_caches()
+    executables.forget()
     return task, lines, passes, time.perf_counter() - began
 
 
@@ -152,11 +154,8 @@ def main() -> int:
         return 0 if compare_roads() else 1
     began, bad, seconds = time.perf_counter(), 0, 0.0
     todo = tasks(chosen.family, chosen.call)
-    # A process that has compiled a dozen programs is let go, and its memory with it.
-    pool = ProcessPoolExecutor(
-        chosen.processes, mp_context=get_context("spawn"), max_tasks_per_child=12
-    )
-    with pool:
+    # Without max_tasks_per_child: with it, Python 3.11 waits for ever once the first workers go.
+    with ProcessPoolExecutor(chosen.processes, mp_context=get_context("spawn")) as pool:
         for task, lines, good, took in pool.map(check, todo):
             bad, seconds = bad + (not good), seconds + took
             verdict = "agrees" if good else "DIFFERS"
