@@ -17,7 +17,7 @@ from jaxcal.backend import (
     RIGID,
     BoundedOffsets,
     Component,
-    Further,
+    FurtherUnknowns,
     ImagePlanes,
     Iterate,
     NormalEquations,
@@ -32,6 +32,7 @@ from jaxcal.solvers.levenberg_marquardt import (
     DAMPING_DECREASE,
     EXACT_BELOW,
     Descent,
+    Minimum,
     Rounding,
     gradient_cosine,
     iterate_once,
@@ -70,7 +71,7 @@ class Eliminated(Observation):
     bounds: BoundedOffsets
     whitened: ClassVar[bool] = False
 
-    def components(self, q: list, further: Further, images: ImagePlanes) -> list[Component]:
+    def components(self, q: list, further: FurtherUnknowns, images: ImagePlanes) -> list[Component]:
         """q_i - p_i(y_i) at the closest point of the arc."""
         offset, _ = self.bounds.local(q, further, images)
         return [Component(on_circle(q, offset, further, images))]
@@ -110,7 +111,7 @@ class Outcome(NamedTuple):
     trace: Array | None = None
 
     @classmethod
-    def of(cls, fit: Descent) -> Outcome:
+    def of(cls, fit: Descent | Minimum) -> Outcome:
         """Of a batch of fits."""
         trace = None if fit.trace is None else fit.trace.T
         return cls(fit.iterate.parameters(), fit.cost, fit.cosine, fit.iterations, trace)

@@ -12,7 +12,7 @@ from tank_placements import part
 from hw.bench.tank import Beam, Noise
 from hw.midplane.search import Settings
 from jaxcal import Problem
-from jaxcal.backend import RIGID, Component, Further, ImagePlanes, Observation, minimise
+from jaxcal.backend import RIGID, Component, FurtherUnknowns, ImagePlanes, Observation, minimise
 from jaxcal.model.batch import pad_images
 from jaxcal.solvers.start import conventional
 
@@ -36,7 +36,7 @@ class PlacedOffsets(Observation):
     sigma: Float[Array, "3 batch"]
     offset_sd: Float[Array, "batch n"]
 
-    def components(self, q: list, further: Further, images: ImagePlanes) -> list[Component]:
+    def components(self, q: list, further: FurtherUnknowns, images: ImagePlanes) -> list[Component]:
         """Errors in the plane, and offsets in their SDs."""
         lateral, distance = further.points(images)
         return [

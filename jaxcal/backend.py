@@ -8,9 +8,9 @@ theorem. Every method begins at :func:`initial_fit`.
 For a batch of problems there are :class:`ImagePlanes` (the data), :class:`Iterate` (the unknowns),
 an :class:`Observation` (:class:`Points`, :class:`OwnCovariances`, :class:`TrackedPoints`,
 :class:`InPlane`, :class:`BoundedOffsets`, :class:`ChannelDistances`, or one of your own),
-:func:`accumulate` (the :class:`NormalEquations`, in one pass over the images), :func:`minimise` and
-:func:`implicit_tangent`. A number of every image is a plane (batch, images); the batch axis of all
-other arrays is the last.
+:func:`accumulate` (the :class:`NormalEquations`, in one pass over the images), :func:`minimise`
+(which returns a :class:`Minimum`) and :func:`implicit_tangent`. A number of every image is a plane
+(batch, images); the batch axis of all other arrays is the last.
 
 :class:`LevenbergMarquardt` is the same loop behind optimistix's interface, for residuals of any
 shape. :func:`arrow_least_squares` is the loop for problems with shared unknowns and one local
@@ -35,7 +35,7 @@ from jaxcal.model.observations import (
     BoundedOffsets,
     ChannelDistances,
     Component,
-    Further,
+    FurtherUnknowns,
     InPlane,
     LocalUnknown,
     Observation,
@@ -51,10 +51,10 @@ from jaxcal.model.residuals import (
     measurement_residual,
     target_in_image,
 )
-from jaxcal.model.unknowns import RIGID, Blocks, size
+from jaxcal.model.unknowns import RIGID, Blocks, count_unknowns
 from jaxcal.solvers.general import LevenbergMarquardt, arrow_least_squares
 from jaxcal.solvers.implicit import implicit_tangent
-from jaxcal.solvers.levenberg_marquardt import minimise
+from jaxcal.solvers.levenberg_marquardt import Minimum, minimise
 from jaxcal.solvers.normal_equations import NormalEquations, accumulate
 from jaxcal.solvers.start import conventional
 
@@ -64,12 +64,13 @@ __all__ = [
     "BoundedOffsets",
     "ChannelDistances",
     "Component",
-    "Further",
+    "FurtherUnknowns",
     "ImagePlanes",
     "InPlane",
     "Iterate",
     "LevenbergMarquardt",
     "LocalUnknown",
+    "Minimum",
     "NormalEquations",
     "Observation",
     "OwnCovariances",
@@ -81,13 +82,13 @@ __all__ = [
     "arrow_least_squares",
     "channel_residual",
     "circle_residual",
+    "count_unknowns",
     "implicit_tangent",
     "initial_fit",
     "measured_points",
     "measurement_residual",
     "minimise",
     "retract",
-    "size",
     "target_in_image",
 ]
 

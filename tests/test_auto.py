@@ -66,7 +66,7 @@ def test_moments_are_those_of_the_product(family, cut):
         found = jax.tree.map(np.asarray, tilted_of(family, *at, *bounds))
         true_mean = moment[1] / moment[0]
         true_variance = moment[2] / moment[0] - true_mean**2
-        assert float(np.log(found.mass[0, 0]) + found.fall[0, 0]) == pytest.approx(
+        assert float(np.log(found.mass[0, 0]) + found.log_factor[0, 0]) == pytest.approx(
             np.log(moment[0]), abs=3e-3
         )
         assert float(found.mean[0, 0]) == pytest.approx(true_mean, abs=2e-3)

@@ -182,7 +182,10 @@ def test_what_the_pieces_cannot_take_is_said_in_a_sentence():
             )
             for made in (None, jnp.zeros(4), jnp.zeros((3, 2)), jnp.zeros((4, 0)))
         ),
-        (lambda: backend.size(("rotation", "angle")), "'angle' is no unknown: choose from trans"),
+        (
+            lambda: backend.count_unknowns(("rotation", "angle")),
+            "'angle' is no unknown: choose from trans",
+        ),
         (
             lambda: backend.retract(backend.initial_fit(one), jnp.zeros(6), backend.RIGID),
             "a step of translation, rotation, point has 9 numbers",

@@ -30,7 +30,7 @@ from jaxcal.model.batch import ImagePlanes, Iterate, barrier, targets
 from jaxcal.model.distributions import OffsetLaw
 from jaxcal.model.parameters import Parameters
 from jaxcal.model.thresholds import LARGEST_ELEVATION, MINIMUM_SELF_TUNING
-from jaxcal.model.unknowns import FURTHER, TABLE, Blocks, block_slice, measured, size
+from jaxcal.model.unknowns import FURTHER, TABLE, Blocks, block_slice, count_unknowns, measured
 from jaxcal.result.calibration import Calibration, Linearisation, Medium, Status
 from jaxcal.solvers.convergence import Convergence
 from jaxcal.solvers.dense import inverse_batch_last
@@ -118,9 +118,9 @@ def assemble(
     if solved.bound is not None:
         bounds = ActiveBounds.of(errors, solved.offset, solved.bound, problem)
         free = used - jnp.sum(bounds.resting, axis=-1)
-        variance = bounds.cost / jnp.maximum(3 * used - size(blocks) - free, 1.0)
+        variance = bounds.cost / jnp.maximum(3 * used - count_unknowns(blocks) - free, 1.0)
     elif plan.prior == "none":
-        variance = in_plane / jnp.maximum(3 * used - size(blocks), 1.0)
+        variance = in_plane / jnp.maximum(3 * used - count_unknowns(blocks), 1.0)
 
     lever = jax.lax.stop_gradient(errors.lever(mask))
     covariance, observed = covariance_and_observability(
@@ -409,7 +409,7 @@ def _three_sigmas(
         return jnp.concatenate([point_sd, solved.sigma[..., 1:]], axis=-1)
     used = jnp.sum(problem.mask, axis=-1)
     # The unknowns' degrees of freedom are shared equally by the three components.
-    freedom = jnp.maximum(used - size(plan.blocks) / 3, 1.0)
+    freedom = jnp.maximum(used - count_unknowns(plan.blocks) / 3, 1.0)
     lateral, distance = (square / freedom for square in errors.mean_squares())
     # Offsets within a bound have a root mean square within it, too.
     own = used if solved.bound is not None else freedom

@@ -19,7 +19,7 @@ import numpy as np
 from jaxcal.data.problem import Problem
 from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns
 from jaxcal.diagnostics.uncertainty import LARGEST_SD, inverses, mm_at_target, threshold
-from jaxcal.model.unknowns import FURTHER, block_slice, size
+from jaxcal.model.unknowns import FURTHER, block_slice, count_unknowns
 from jaxcal.result.calibration import Calibration, Linearisation, Medium, Status
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.arrays import map_arrays
@@ -61,12 +61,12 @@ def _with_uncertainty(found: ClosedForm, problem: Problem, plan: SolvePlan) -> C
     seen = ImageErrors.of(unknowns, map_arrays(lambda a: a[None], problem), blocks)
     plane = np.zeros_like(seen.mask)
     residual, axial = seen.from_circle(plane)
-    rows = seen.circle_rows(axial).reshape(-1, size(blocks))
+    rows = seen.circle_rows(axial).reshape(-1, count_unknowns(blocks))
     errors = residual.ravel()
     information = rows.T @ rows
     used = float(seen.mask.sum())
     objective = float(errors @ errors)
-    variance = objective / max(3 * used - size(blocks), 1.0)
+    variance = objective / max(3 * used - count_unknowns(blocks), 1.0)
 
     # As in jaxcal.calibration.answer: which directions are known, in mm at the target.
     lever = seen.lever(seen.mask)
@@ -149,7 +149,7 @@ def _unknowns(found: ClosedForm, problem: Problem) -> Unknowns:
 
 def _sigmas(seen: ImageErrors, used: float, blocks: tuple[str, ...]) -> Float[np.ndarray, 3]:
     """SDs of lateral position, range and offset, each with n less a third of the unknowns."""
-    return np.sqrt((seen.errors[0] ** 2).sum(axis=0) / max(used - size(blocks) / 3, 1.0))
+    return np.sqrt((seen.errors[0] ** 2).sum(axis=0) / max(used - count_unknowns(blocks) / 3, 1.0))
 
 
 def _medium(

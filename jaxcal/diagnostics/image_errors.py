@@ -19,7 +19,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxcal.model import unknowns as model
-from jaxcal.model.unknowns import RIGID, TINY, further_derivatives, size, split_further
+from jaxcal.model.unknowns import (
+    RIGID_UNKNOWNS,
+    TINY,
+    count_unknowns,
+    further_derivatives,
+    split_further,
+)
 from jaxcal.runtime.array_types import AnyArray, Float
 from jaxcal.runtime.arrays import array_module
 
@@ -173,7 +179,7 @@ class ImageErrors:
     def circle_rows(self, axial: Float[Array, "k n"]) -> Float[Array, "k n 3 p"]:
         """Derivatives of :meth:`from_circle` by the unknowns, the elevation held."""
         rows = motion(self.q, self.turned, self.blocks) * self.mask[..., None, None]
-        further = size(RIGID)
+        further = RIGID_UNKNOWNS
         # Further unknowns move the measured point instead of q.
         rows[..., 0, further:] = self.rows[..., 0, further:]
         stretch = self.distance / axial
@@ -313,7 +319,7 @@ def motion(
 ) -> Float[Array, "k n 3 p"]:
     """Derivatives of q by the unknowns; blocks begin with X and the target."""
     x, y, z = np.moveaxis(q, -1, 0)
-    along = np.zeros((*q.shape, size(blocks)))
+    along = np.zeros((*q.shape, count_unknowns(blocks)))
     along[..., [0, 1, 2], [0, 1, 2]] = -1.0
     along[..., 0, 4], along[..., 0, 5] = -z, y
     along[..., 1, 3], along[..., 1, 5] = z, -x

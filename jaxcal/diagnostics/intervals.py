@@ -34,7 +34,7 @@ from scipy import special
 from jaxcal import InputError
 from jaxcal.data.sound import WATER_M_S
 from jaxcal.model.image_points import mean_of_squares, point_jacobian
-from jaxcal.model.unknowns import in_image, size
+from jaxcal.model.unknowns import count_unknowns, in_image
 from jaxcal.runtime.array_types import AnyArray, Float
 from jaxcal.runtime.arrays import array_module, is_traced
 from jaxcal.runtime.given_values import is_number, real_array
@@ -76,7 +76,9 @@ def degrees_of_freedom(calibration: Calibration) -> Float[AnyArray, "*batch"]:
     """Degrees of freedom of the noise's SDs (traceable); inf where SDs were given."""
     _check(calibration)
     xp = array_module(calibration)
-    left = xp.sum(xp.asarray(calibration.mask) > 0, axis=-1) - size(calibration.blocks) / 3
+    left = (
+        xp.sum(xp.asarray(calibration.mask) > 0, axis=-1) - count_unknowns(calibration.blocks) / 3
+    )
     if calibration.prior not in TUNED:
         return xp.asarray(xp.maximum(left, 1.0))
     return xp.where(calibration.sigma_tuned, xp.maximum(left, 1.0), np.inf)

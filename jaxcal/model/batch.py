@@ -20,15 +20,20 @@ from jaxcal import InputError
 from jaxcal.data.problem import Problem
 from jaxcal.model import unrolled
 from jaxcal.model.parameters import Parameters
-from jaxcal.model.unknowns import FURTHER, Blocks, block_slice, size, step_between, stepped
+from jaxcal.model.unknowns import (
+    FURTHER,
+    RIGID_UNKNOWNS,
+    Blocks,
+    block_slice,
+    count_unknowns,
+    step_between,
+    stepped,
+)
 from jaxcal.model.unrolled import Matrix, Vector
 
-_CROSS_PLACES = np.array([[0, 2, 1], [2, 0, 0], [1, 0, 0]])
+_CROSS_INDICES = np.array([[0, 2, 1], [2, 0, 0], [1, 0, 0]])
 _CROSS_SIGNS = np.array([[0.0, -1.0, 1.0], [1.0, 0.0, -1.0], [-1.0, 1.0, 0.0]])[..., None]
-"""[v]x has the entries of v at these places with these signs."""
-
-RIGID_UNKNOWNS = 9
-"""Unknowns of X and the target; further unknowns follow them."""
+"""[v]x has the entries of v at these indices with these signs."""
 
 
 class ElementPlanes(eqx.Module):
@@ -190,7 +195,7 @@ class Iterate(eqx.Module):
     @property
     def unknowns(self) -> int:
         """Number of unknowns of one problem."""
-        return size(self.blocks)
+        return count_unknowns(self.blocks)
 
     def further(self, name: str) -> Float[Array, "k batch"] | None:
         """The values of a further unknown, one row for each component; None if it is not free."""
@@ -252,22 +257,22 @@ def _cayley(vector: Float[Array, "3 batch"]) -> Float[Array, "3 3 batch"]:
     """:func:`jaxcal.model.unrolled.rotation` of vectors; batch axis last."""
     half = 0.5 * vector
     square = jnp.sum(half * half, axis=0)
-    cross = picked(half, _CROSS_PLACES) * _CROSS_SIGNS.astype(half.dtype)
+    cross = picked(half, _CROSS_INDICES) * _CROSS_SIGNS.astype(half.dtype)
     eye = np.eye(3, dtype=half.dtype)[..., None]
     bent = half[:, None] * half - square * eye
     return jnp.asarray(eye) + (2 / (1 + square)) * (cross + bent)
 
 
-def picked(array: Float[Array, "k ..."], places: np.ndarray) -> Float[Array, "*places ..."]:
-    """The entries at known places of the first axis, in one operation."""
+def picked(array: Float[Array, "k ..."], indices: np.ndarray) -> Float[Array, "*indices ..."]:
+    """The entries at known indices of the first axis, in one operation."""
     # Unsigned, because JAX adds the size to negative indices, in the integer type of whoever traced
     # that code first, which may have another number of bits.
-    return array.at[places.astype(np.uint32)].get(mode="promise_in_bounds")
+    return array.at[indices.astype(np.uint32)].get(mode="promise_in_bounds")
 
 
 def _further_names(blocks: Blocks) -> list[str]:
     """The block of every further unknown, in order."""
-    return [name for name in FURTHER if name in blocks for _ in range(size((name,)))]
+    return [name for name in FURTHER if name in blocks for _ in range(count_unknowns((name,)))]
 
 
 @jax.jit

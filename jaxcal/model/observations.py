@@ -35,11 +35,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxcal import InputError
-from jaxcal.model.batch import RIGID_UNKNOWNS, ImagePlanes, Iterate, pad_images, targets
+from jaxcal.model.batch import ImagePlanes, Iterate, pad_images, targets
 from jaxcal.model.thresholds import LARGEST_ELEVATION
 from jaxcal.model.unknowns import (
     FURTHER,
     MEDIUM,
+    RIGID_UNKNOWNS,
     TABLE,
     Blocks,
     block_slice,
@@ -55,7 +56,7 @@ TRACKER_STEPS = 4
 """Newton steps for a tracker's elevational error; the range curves so little that two would do."""
 
 
-class Further(eqx.Module):
+class FurtherUnknowns(eqx.Module):
     """What residuals may depend on beside q: the free further unknowns, and the rotation M_i.
 
     Attributes:
@@ -71,7 +72,7 @@ class Further(eqx.Module):
     @classmethod
     def of(
         cls, iterate: Iterate, tangent: Vector, tracker_to_image: Matrix | None = None
-    ) -> Further:
+    ) -> FurtherUnknowns:
         """The iterate's further unknowns, moved by a step, and the tracker's axes."""
         values = {}
         for name in FURTHER:
@@ -86,7 +87,7 @@ class Further(eqx.Module):
         return cls(values, tracker_to_image)
 
     @classmethod
-    def at(cls, iterate: Iterate, tracker_to_image: Matrix | None = None) -> Further:
+    def at(cls, iterate: Iterate, tracker_to_image: Matrix | None = None) -> FurtherUnknowns:
         """The iterate's further unknowns as they are."""
         still = jnp.zeros_like(iterate.point[0])[:, None]
         return cls.of(iterate, [still] * iterate.further_values.shape[0], tracker_to_image)
@@ -133,7 +134,9 @@ class Observation(eqx.Module):
         _check_values("sigma", self.sigma)
 
     @abc.abstractmethod
-    def components(self, q: Vector, further: Further, images: ImagePlanes) -> list[Component]:
+    def components(
+        self, q: Vector, further: FurtherUnknowns, images: ImagePlanes
+    ) -> list[Component]:
         """The residuals of every image.
 
         Args:
@@ -207,12 +210,14 @@ class Points(Observation):
 
     sigma: Float[Array, "3 batch"]
 
-    def components(self, q: Vector, further: Further, images: ImagePlanes) -> list[Component]:
+    def components(
+        self, q: Vector, further: FurtherUnknowns, images: ImagePlanes
+    ) -> list[Component]:
         lateral, distance = errors(q, further, images)
         return [Component([lateral]), Component([distance]), Component([q[1]])]
 
 
-def errors(q: Vector, further: Further, images: ImagePlanes) -> tuple[Array, Array]:
+def errors(q: Vector, further: FurtherUnknowns, images: ImagePlanes) -> tuple[Array, Array]:
     """Error of lateral position and of range, mm, of every image."""
     lateral, distance = further.points(images)
     square = q[1] * q[1] + q[2] * q[2]
@@ -243,15 +248,17 @@ class OwnCovariances(Observation):
     ratio: Float[Array, " batch"]
     tied: bool = eqx.field(static=True, default=False)
 
-    def components(self, q: Vector, further: Further, images: ImagePlanes) -> list[Component]:
+    def components(
+        self, q: Vector, further: FurtherUnknowns, images: ImagePlanes
+    ) -> list[Component]:
         lateral, distance = errors(q, further, images)
         first, mixed, second = factor_of(self.shape)
-        one = lateral / first
+        white_lateral = lateral / first
         # A mm of lateral error counts as ``ratio`` mm of range error.
-        other = (distance - self.ratio[:, None] * mixed * one) / second
+        white_distance = (distance - self.ratio[:, None] * mixed * white_lateral) / second
         if self.tied:
-            return [Component([one, other]), Component([q[1]])]
-        return [Component([one]), Component([other]), Component([q[1]])]
+            return [Component([white_lateral, white_distance]), Component([q[1]])]
+        return [Component([white_lateral]), Component([white_distance]), Component([q[1]])]
 
     def count(self, images: ImagePlanes) -> Float[Array, "components batch"]:
         used = images.used
@@ -328,7 +335,9 @@ class ChannelDistances(Observation):
 
     sigma: Float[Array, "2 batch"]
 
-    def components(self, q: Vector, further: Further, images: ImagePlanes) -> list[Component]:
+    def components(
+        self, q: Vector, further: FurtherUnknowns, images: ImagePlanes
+    ) -> list[Component]:
         channels = images.channels
         if channels is None:
             raise InputError("the problem has no times of flight")
@@ -348,7 +357,7 @@ def _unit(images: ImagePlanes) -> Float[Array, "1 batch"]:
     return jnp.ones((1, images.batch_size), images.mask.dtype)
 
 
-def on_circle(q: Vector, y: Array, further: Further, images: ImagePlanes) -> Vector:
+def on_circle(q: Vector, y: Array, further: FurtherUnknowns, images: ImagePlanes) -> Vector:
     """Q - p(y), mm: the residuals of Eq. 7 at a given offset."""
     lateral, distance = further.points(images)
     return [q[0] - lateral, q[1] - y, q[2] - jnp.sqrt(distance * distance - y * y)]
@@ -369,7 +378,9 @@ class InPlane(Observation):
         """For these images."""
         return cls(_unit(images))
 
-    def components(self, q: Vector, further: Further, images: ImagePlanes) -> list[Component]:
+    def components(
+        self, q: Vector, further: FurtherUnknowns, images: ImagePlanes
+    ) -> list[Component]:
         lateral, distance = further.points(images)
         return [Component([q[0] - lateral, q[1], q[2] - distance])]
 
@@ -391,7 +402,9 @@ class HeldOffsets(Observation):
         """For these images."""
         return cls(_unit(images), offset)
 
-    def components(self, q: Vector, further: Further, images: ImagePlanes) -> list[Component]:
+    def components(
+        self, q: Vector, further: FurtherUnknowns, images: ImagePlanes
+    ) -> list[Component]:
         return [Component(on_circle(q, self.offset, further, images))]
 
     def padded(self) -> HeldOffsets:
@@ -403,7 +416,9 @@ class LocalUnknown(Observation):
     """An observation with one more unknown in every image, which is eliminated there."""
 
     @abc.abstractmethod
-    def local(self, q: Vector, further: Further, images: ImagePlanes) -> tuple[Array, Array]:
+    def local(
+        self, q: Vector, further: FurtherUnknowns, images: ImagePlanes
+    ) -> tuple[Array, Array]:
         """The image's own unknown at its best for given q, and 1 where it is free (0 on a bound).
 
         Both are planes (batch, n). The arguments are those of :meth:`Observation.components`.
@@ -411,11 +426,13 @@ class LocalUnknown(Observation):
 
     @abc.abstractmethod
     def components_at(
-        self, q: Vector, local: Array, further: Further, images: ImagePlanes
+        self, q: Vector, local: Array, further: FurtherUnknowns, images: ImagePlanes
     ) -> list[Component]:
         """:meth:`Observation.components` at a value of the image's own unknown."""
 
-    def components(self, q: Vector, further: Further, images: ImagePlanes) -> list[Component]:
+    def components(
+        self, q: Vector, further: FurtherUnknowns, images: ImagePlanes
+    ) -> list[Component]:
         return self.components_at(q, self.local(q, further, images)[0], further, images)
 
     def geometry(self, images: ImagePlanes) -> Observation:
@@ -427,7 +444,9 @@ def local_unknowns(
 ) -> Float[Array, "batch n"]:
     """Every image's own unknown at its best; 0 for images left out."""
     q, tracker_to_image = targets(iterate, images)
-    return images.mask * observation.local(q, Further.at(iterate, tracker_to_image), images)[0]
+    return (
+        images.mask * observation.local(q, FurtherUnknowns.at(iterate, tracker_to_image), images)[0]
+    )
 
 
 class BoundedOffsets(LocalUnknown):
@@ -453,11 +472,13 @@ class BoundedOffsets(LocalUnknown):
         """For these images."""
         return cls(_unit(images), bound)
 
-    def limit(self, further: Further, images: ImagePlanes) -> Array:
+    def limit(self, further: FurtherUnknowns, images: ImagePlanes) -> Array:
         """The largest |y_i|, mm."""
         return jnp.minimum(self.bound, LARGEST_ELEVATION * jnp.abs(further.points(images)[1]))
 
-    def local(self, q: Vector, further: Further, images: ImagePlanes) -> tuple[Array, Array]:
+    def local(
+        self, q: Vector, further: FurtherUnknowns, images: ImagePlanes
+    ) -> tuple[Array, Array]:
         """The y_i of the point closest to q_i on the arc |y| <= bound (section 2.4), mm.
 
         On the circle the distance grows with the angle away from q_i. So the closest point of the
@@ -472,7 +493,7 @@ class BoundedOffsets(LocalUnknown):
         return jnp.clip(free, -limit, limit), jnp.where(jnp.abs(free) < limit, 1.0, 0.0)
 
     def components_at(
-        self, q: Vector, local: Array, further: Further, images: ImagePlanes
+        self, q: Vector, local: Array, further: FurtherUnknowns, images: ImagePlanes
     ) -> list[Component]:
         return [Component(on_circle(q, local, further, images))]
 
@@ -505,7 +526,7 @@ class TrackedPoints(LocalUnknown):
         _check_values("tracker_sd", self.tracker_sd, zero=True)
 
     def components_at(
-        self, q: Vector, local: Array, further: Further, images: ImagePlanes
+        self, q: Vector, local: Array, further: FurtherUnknowns, images: ImagePlanes
     ) -> list[Component]:
         # Scaled so that division by the component's SD, which leaves out the tracker, whitens each.
         tau = self.tracker_sd[:, None]
@@ -513,22 +534,24 @@ class TrackedPoints(LocalUnknown):
         lateral, distance = errors([q[0], offset, q[2]], further, images)
         sigma = [value[:, None] for value in self.sigma]
         if self.shape is None:
-            one = lateral / jnp.hypot(sigma[0], tau)
-            other = distance / jnp.hypot(sigma[1], tau)
+            white_lateral = lateral / jnp.hypot(sigma[0], tau)
+            white_distance = distance / jnp.hypot(sigma[1], tau)
         else:
             # The tracker's error has one size, whatever the image's own covariance is.
             mixed = sigma[0] * sigma[1] * self.shape[1]
             variances = [sigma[k] ** 2 * self.shape[2 * k] + tau**2 for k in (0, 1)]
             first, mixed, last = factor_of(jnp.stack([variances[0], mixed, variances[1]]))
-            one = lateral / first
-            other = (distance - mixed * one) / last
+            white_lateral = lateral / first
+            white_distance = (distance - mixed * white_lateral) / last
         return [
-            Component([one * sigma[0]]),
-            Component([other * sigma[1]]),
+            Component([white_lateral * sigma[0]]),
+            Component([white_distance * sigma[1]]),
             Component([offset, local * sigma[2]]),
         ]
 
-    def local(self, q: Vector, further: Further, images: ImagePlanes) -> tuple[Array, Array]:
+    def local(
+        self, q: Vector, further: FurtherUnknowns, images: ImagePlanes
+    ) -> tuple[Array, Array]:
         def halved(local: Array) -> Array:
             parts = self.components_at(q, local, further, images)
             weighed = [

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from jaxcal import InputError
 from jaxcal.data.geometry import matrix_from_rotation, rotation_from_vector
-from jaxcal.model.unknowns import FURTHER, TABLE, Blocks, block_slice, size, stepped
+from jaxcal.model.unknowns import FURTHER, TABLE, Blocks, block_slice, count_unknowns, stepped
 
 
 class Parameters(eqx.Module):
@@ -85,9 +85,9 @@ def retract(parameters: Parameters, tangent: Float[Array, " p"], blocks: Blocks)
     Raises:
         InputError: as many numbers as the blocks have unknowns are needed.
     """
-    if tangent.shape != (size(blocks),):
+    if tangent.shape != (count_unknowns(blocks),):
         raise InputError(
-            f"a step of {', '.join(blocks)} has {size(blocks)} numbers, not the shape "
+            f"a step of {', '.join(blocks)} has {count_unknowns(blocks)} numbers, not the shape "
             f"{tangent.shape}"
         )
 

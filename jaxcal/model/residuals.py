@@ -14,19 +14,19 @@ from jaxtyping import Array, Float
 from jaxcal import InputError
 from jaxcal.data.problem import Problem
 from jaxcal.model.batch import ImagePlanes, Iterate, targets
-from jaxcal.model.observations import ChannelDistances, Further, Points, on_circle
+from jaxcal.model.observations import ChannelDistances, FurtherUnknowns, Points, on_circle
 from jaxcal.model.parameters import Parameters
 from jaxcal.model.unknowns import FURTHER, RIGID
 
 
 def _batch_of_one(
     parameters: Parameters, problem: Problem, *, channels: bool = False
-) -> tuple[ImagePlanes, Further, list[Array]]:
+) -> tuple[ImagePlanes, FurtherUnknowns, list[Array]]:
     """The images, the further unknowns and q of one problem, as planes of a batch of one."""
     alone = jax.tree.map(lambda leaf: leaf[None], (parameters, problem))
     images = ImagePlanes.of(alone[1], channels=channels)
     iterate = Iterate.of(alone[0], RIGID + FURTHER)
-    return images, Further.at(iterate), targets(iterate, images)[0]
+    return images, FurtherUnknowns.at(iterate), targets(iterate, images)[0]
 
 
 def measured_points(parameters: Parameters, problem: Problem) -> Float[Array, "n 2"]:

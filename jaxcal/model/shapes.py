@@ -71,14 +71,14 @@ class Moments(eqx.Module):
     """Of a shape times a normalised Gaussian.
 
     Attributes:
-        mass: over e to the power of ``fall``, which keeps it within the range of numbers.
-        fall: part of the logarithm of the mass.
+        mass: without the factor exp(``log_factor``), so that it stays within the range of numbers.
+        log_factor: logarithm of that factor.
         mean: mm.
         variance: mm^2.
     """
 
     mass: Float[Array, "k n"]
-    fall: Float[Array, "k n"]
+    log_factor: Float[Array, "k n"]
     mean: Float[Array, "k n"]
     variance: Float[Array, "k n"]
 
@@ -103,16 +103,16 @@ def tilted(
     """
     sd = sd[:, None]
     cut = lower is not None or upper is not None
-    fall = 0.0
+    log_factor = 0.0
     edge = EDGE[family] * sd
     if family == "gaussian":
         # A Gaussian times a Gaussian is a Gaussian; if it is cut, it is a flat shape times one.
         both = variance + sd**2
-        fall = -0.5 * mean**2 / both
+        log_factor = -0.5 * mean**2 / both
         height = jax.lax.rsqrt(2 * np.pi * both)
         mean, variance = mean * sd**2 / both, variance * sd**2 / both
         if not cut:
-            return Moments(height, fall, mean, variance)
+            return Moments(height, log_factor, mean, variance)
         family = "uniform"
     else:
         height = HEIGHT[family] / sd
@@ -133,8 +133,8 @@ def tilted(
     place = line * inverse
     spread = parabola * inverse - place * place
     mass = height * total * step * jnp.sqrt(precision / (2 * np.pi))
-    fall = fall - 0.5 * out * out * precision
-    return Moments(mass, fall, middle + place * step, spread * (step * step))
+    log_factor = log_factor - 0.5 * out * out * precision
+    return Moments(mass, log_factor, middle + place * step, spread * (step * step))
 
 
 Window = tuple[Array, Array, Array, Array, Array, Array]

@@ -128,6 +128,9 @@ TABLE = {
 RIGID: Blocks = ("translation", "rotation", "point")
 """The unknowns of Eq. 7: X and the target."""
 
+RIGID_UNKNOWNS = sum(TABLE[name].size for name in RIGID)
+"""Number of scalar unknowns in :data:`RIGID`; further unknowns follow them."""
+
 FURTHER: Blocks = tuple(name for name in TABLE if name not in RIGID)
 """Further unknowns: what a caller may ask for beside X and the target."""
 
@@ -222,7 +225,7 @@ def further_derivatives(
     return found
 
 
-def size(blocks: Blocks) -> int:
+def count_unknowns(blocks: Blocks) -> int:
     """Number of scalar unknowns in the given blocks.
 
     Raises:
@@ -246,7 +249,7 @@ def block_slice(blocks: Blocks, name: str) -> slice:
 
 def split_further(values: Any, blocks: Blocks) -> dict[str, list[Any]]:
     """Arrays (..., k) of all free further unknowns as components of each, by name."""
-    first = size(RIGID)
+    first = RIGID_UNKNOWNS
     found = {}
     for name in FURTHER:
         if name in blocks:

@@ -23,10 +23,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxcal.data.geometry import chord_angle
 from jaxcal.model.batch import ImagePlanes, Iterate, barrier, choose
-from jaxcal.model.observations import BoundedOffsets, Further, HeldOffsets, local_unknowns
+from jaxcal.model.observations import BoundedOffsets, FurtherUnknowns, HeldOffsets, local_unknowns
 from jaxcal.solvers import dense
 from jaxcal.solvers.levenberg_marquardt import (
-    Descent,
+    Minimum,
     Rounding,
     empty_trace,
     gradient_cosine,
@@ -155,7 +155,7 @@ def bounded(
     *,
     max_steps: int = 100,
     trace: int = 0,
-) -> Descent:
+) -> Minimum:
     """The joint solve with bounded offsets.
 
     Args:
@@ -168,7 +168,7 @@ def bounded(
     Returns:
         The fits; their iterations count those from all starts, and the warm-up.
     """
-    further = Further.at(start)
+    further = FurtherUnknowns.at(start)
     bound = jnp.sum(images.mask * observation.limit(further, images), axis=1)
     turn = bound / jnp.sum(images.mask * further.points(images)[1], axis=1)
     zero = jnp.zeros_like(turn)
@@ -212,4 +212,4 @@ def bounded(
         fit = choose(best == k, other, fit)
     taken = jnp.sum(jnp.stack([part.iterations for part in parts]), axis=0)
     taken = taken + WARM_UP_ROUNDS * len(TURNS)
-    return eqx.tree_at(lambda descent: descent.iterations, fit, taken.astype(jnp.int32))
+    return eqx.tree_at(lambda found: found.iterations, fit, taken.astype(jnp.int32))

@@ -43,7 +43,7 @@ from jaxcal.data.problem import Problem
 from jaxcal.model.parameters import Parameters, retract
 from jaxcal.model.residuals import measured_points, measurement_residual
 from jaxcal.model.thresholds import CUT, FEW_IMAGES, FEWEST_IMAGES, MAD, RELATIVE_FLOOR
-from jaxcal.model.unknowns import Blocks, size
+from jaxcal.model.unknowns import Blocks, count_unknowns
 from jaxcal.solvers import dense
 from jaxcal.solvers.proposals import SUBSET, linear_proposals, nominal, subset_weights
 
@@ -243,7 +243,7 @@ def _robust(
 ) -> Float[Array, 3]:
     """SDs of the components from the median magnitudes of the weighted images, mm."""
     # The unknowns' degrees of freedom are shared equally by the three components.
-    freedom = jnp.maximum(1 - size(model.blocks) / (3 * jnp.sum(weight)), 0.1)
+    freedom = jnp.maximum(1 - count_unknowns(model.blocks) / (3 * jnp.sum(weight)), 0.1)
     return _with_floor(MAD * _medians(errors, weight, model) / jnp.sqrt(freedom))
 
 
@@ -284,7 +284,7 @@ def _linearise(
     def errors(tangent: Float[Array, " p"]) -> Float[Array, "n 3"]:
         return model.errors(retract(parameters, tangent, model.blocks), problem)
 
-    zero = jnp.zeros(size(model.blocks), problem.mask.dtype)
+    zero = jnp.zeros(count_unknowns(model.blocks), problem.mask.dtype)
     value, push = jax.linearize(errors, zero)
     return value, jax.vmap(push)(jnp.eye(len(zero), dtype=zero.dtype))
 

@@ -38,7 +38,7 @@ from jaxcal.solvers.normal_equations import (
     ComponentSums,
     component_sums,
     pairs,
-    square_places,
+    square_indices,
     stacked,
 )
 from jaxcal.solvers.offset_mean import MEAN_SD, influences, log_evidence_gain, mean_belief, trust_in
@@ -146,7 +146,7 @@ class System(eqx.Module):
 
 def row_of(flat: Float[Array, "triangle batch"], k: int) -> Float[Array, "p batch"]:
     """A row of a symmetric matrix from its upper triangle."""
-    return picked(flat, square_places(int((2 * flat.shape[0]) ** 0.5))[k])
+    return picked(flat, square_indices(int((2 * flat.shape[0]) ** 0.5))[k])
 
 
 def tune(

@@ -45,12 +45,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxcal.model import unrolled
-from jaxcal.model.batch import RIGID_UNKNOWNS, barrier, picked, total
+from jaxcal.model.batch import barrier, picked, total
 from jaxcal.model.shapes import Family, Moments, tilted
+from jaxcal.model.unknowns import RIGID_UNKNOWNS
 from jaxcal.model.unrolled import Matrix, Vector
 from jaxcal.runtime.compiler import traced_once
 from jaxcal.solvers import dense
-from jaxcal.solvers.normal_equations import V_Y, pairs, square_places, stacked
+from jaxcal.solvers.normal_equations import V_Y, pairs, square_indices, stacked
 
 SWEEPS = 3
 """Sweeps under each law, from the sites of the law before; a family's first gets twice as many."""
@@ -195,10 +196,10 @@ def marginal(
     order = np.array([*eliminated(unknowns), *SITE_UNKNOWNS])
     is_mean = order == unknowns
     from_flat = np.where(is_mean, V_Y, order)
-    places = square_places(unknowns)[np.ix_(from_flat, from_flat)]
+    indices = square_indices(unknowns)[np.ix_(from_flat, from_flat)]
     sign = np.where(is_mean, -1, 1).astype(information.dtype)
     last = is_mean[:, None, None] & is_mean[:, None]
-    full = picked(information, places) * (sign[:, None] * sign)[..., None]
+    full = picked(information, indices) * (sign[:, None] * sign)[..., None]
     full = full + jnp.where(last, precision, 0.0)
     force = -picked(gradient, from_flat) * sign[:, None]
     force = force - jnp.where(is_mean[:, None], precision * mean, 0.0)
@@ -325,7 +326,7 @@ def site_part(
 ) -> tuple[Float[Array, "6 6 batch"], Float[Array, "6 batch"]]:
     """The parts for z of sums of h_i h_i' (upper triangle) and h_i o_i over all unknowns."""
     at = np.array(SITE_UNKNOWNS)
-    return picked(squares, square_places(pull.shape[0])[np.ix_(at, at)]), picked(pull, at)
+    return picked(squares, square_indices(pull.shape[0])[np.ix_(at, at)]), picked(pull, at)
 
 
 def _solved(information: Float[Array, "6 6 batch"], rhs: Float[Array, "6 batch"]) -> _Belief:
@@ -399,7 +400,7 @@ class _Laws(eqx.Module):
 
         # The evidence is stationary in the sites, so it is as good before the last sweep as after.
         joined = 1 + tau * without
-        site = found.fall + jnp.log(found.mass * jnp.sqrt(joined))
+        site = found.log_factor + jnp.log(found.mass * jnp.sqrt(joined))
         site = site - 0.5 * ((centre + without * nu) ** 2 / joined - centre**2) / without
         site = site + nu * offset - 0.5 * tau * offset**2
         dominated = jnp.where(tau * without > 0.99 / LEAST_ROOM, used, 0.0)

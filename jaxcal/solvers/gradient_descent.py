@@ -19,7 +19,7 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from jaxcal.model.batch import ImagePlanes, Iterate
-from jaxcal.model.observations import Further, InPlane
+from jaxcal.model.observations import FurtherUnknowns, InPlane
 from jaxcal.solvers.plan import Options
 from jaxcal.solvers.with_optimistix import Fit
 
@@ -37,7 +37,7 @@ class SteepestDescent(optx.AbstractGradientDescent):
 
 def reconstructed(iterate: Iterate, images: ImagePlanes) -> Float[Array, "3 batch n"]:
     """B_i X p_i, the target as reconstructed from every image, in the tracker's frame, mm."""
-    lateral, distance = Further.at(iterate).points(images)
+    lateral, distance = FurtherUnknowns.at(iterate).points(images)
     in_probe = (
         iterate.rotation[:, 0, :, None] * lateral + iterate.rotation[:, 2, :, None] * distance
     )

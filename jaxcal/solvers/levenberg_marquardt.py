@@ -69,7 +69,7 @@ Equations = Callable[[Any, Float[Array, " batch"]], NormalEquations]
 """From unknowns, and 1 where second derivatives are to be exact, to their normal equations."""
 
 
-class Judged(eqx.Module):
+class StepJudgement(eqx.Module):
     """The judgement of a step.
 
     Attributes:
@@ -95,7 +95,7 @@ def judge_step(
     retry: Bool[Array, " batch"],
     decrease_exact: float = DAMPING_DECREASE_EXACT,
     allowance: Float[Array, " batch"] | float = 0.0,
-) -> Judged:
+) -> StepJudgement:
     """The acceptance rule.
 
     Args:
@@ -119,15 +119,35 @@ def judge_step(
     factor = jnp.where(good, jnp.where(exact, decrease_exact, DAMPING_DECREASE), 1.0)
     raised = jnp.maximum(DAMPING_INCREASE * damping, LEAST_DAMPING)
     gained = jnp.where(decrease > noise, 0, stalled + 1)
-    return Judged(
+    return StepJudgement(
         accept,
         jnp.where(accept, factor * damping, raised),
         jnp.where(accept & jnp.logical_not(retry), gained, stalled),
     )
 
 
+class Minimum(eqx.Module):
+    """Where :func:`minimise` stopped, for every problem; batch axis last.
+
+    Attributes:
+        iterate: the best unknowns that were found.
+        cost: sum of squared (whitened) residuals; without a last step that was not evaluated.
+        cosine: gradient cosine max_k |g_k| / (|J_k| |r|); after such a step, its bound.
+        iterations: number of evaluations.
+        converged: the gradient cosine met its tolerance, or steps gain nothing above rounding.
+        trace: best cost after each of the first evaluations; NaN beyond the last; None: not kept.
+    """
+
+    iterate: Iterate
+    cost: Float[Array, " batch"]
+    cosine: Float[Array, " batch"]
+    iterations: Int[Array, " batch"]
+    converged: Bool[Array, " batch"]
+    trace: Float[Array, "trace batch"] | None
+
+
 class Descent(eqx.Module):
-    """The state of every problem.
+    """The state of the loop, for every problem.
 
     Attributes:
         iterate: the best unknowns so far.
@@ -355,7 +375,7 @@ def minimise(
     tolerance: float | None = None,
     max_steps: int = 100,
     trace: int = 0,
-) -> Descent:
+) -> Minimum:
     """Minimise every problem's objective.
 
     Args:
@@ -369,8 +389,7 @@ def minimise(
         trace: how many values of the cost to keep.
 
     Returns:
-        The final state, for every problem: the unknowns (``iterate``), ``cost``, gradient cosine
-        (``cosine``), number of ``iterations``, whether it ``converged``, and the ``trace``.
+        Where it stopped, for every problem.
     """
     if tolerance is None:
         tolerance = default_tolerance(images.mask.dtype)
@@ -399,7 +418,15 @@ def minimise(
             decrease_exact=decrease_exact,
         )
 
-    return jax.lax.while_loop(lambda state: jnp.any(state.active), one, begun)
+    ended: Descent = jax.lax.while_loop(lambda state: jnp.any(state.active), one, begun)
+    return Minimum(
+        iterate=ended.iterate,
+        cost=ended.cost,
+        cosine=ended.cosine,
+        iterations=ended.iterations,
+        converged=ended.converged,
+        trace=ended.trace,
+    )
 
 
 def default_tolerance(dtype: jnp.dtype) -> float:

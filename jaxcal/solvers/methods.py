@@ -35,7 +35,7 @@ from jaxcal.solvers.alternating import Alternation, alternate, bounded
 from jaxcal.solvers.auto import average_over_laws
 from jaxcal.solvers.convergence import Convergence
 from jaxcal.solvers.gradient_descent import pairwise_gradient
-from jaxcal.solvers.levenberg_marquardt import Descent, minimise
+from jaxcal.solvers.levenberg_marquardt import Minimum, minimise
 from jaxcal.solvers.plan import DEFAULT_MAX_ELEVATION_MM, Given, Options, SolvePlan
 from jaxcal.solvers.reml import SelfTuned, on_floor, self_tuned
 from jaxcal.solvers.start import ConventionalStart, GivenStart, conventional
@@ -190,7 +190,7 @@ def _descended(
     medium: MediumPrior | None,
     images: ImagePlanes,
     plan: SolvePlan,
-) -> Alternation | Descent | Fit | SelfTuned:
+) -> Alternation | Minimum | Fit | SelfTuned:
     """Where the plan's method stops."""
     options, other, start = plan.options, plan.other_solver, begun.iterate
     limits = {"max_steps": options.max_iterations, "trace": options.trace}

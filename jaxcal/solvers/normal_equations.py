@@ -38,12 +38,19 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxcal.model import derivatives, unrolled
-from jaxcal.model.batch import RIGID_UNKNOWNS, ImagePlanes, Iterate, picked, targets, total
-from jaxcal.model.observations import Component, Further, LocalUnknown, MediumPrior, Observation
+from jaxcal.model.batch import ImagePlanes, Iterate, picked, targets, total
+from jaxcal.model.observations import (
+    Component,
+    FurtherUnknowns,
+    LocalUnknown,
+    MediumPrior,
+    Observation,
+)
+from jaxcal.model.unknowns import RIGID_UNKNOWNS
 from jaxcal.model.unrolled import Entry, Matrix, Vector
 
-IN_IMAGE = 3
-"""Coordinates of q."""
+Q_SIZE = 3
+"""Number of coordinates of q."""
 
 V_Y = 1
 """Index of v_y, the unknown that moves every q_iy by -1."""
@@ -59,12 +66,12 @@ def pairs(unknowns: int) -> list[tuple[int, int]]:
 
 
 @cache
-def square_places(unknowns: int) -> np.ndarray:
-    """Position in a flat upper triangle of every entry of the full matrix."""
-    places = np.zeros((unknowns, unknowns), int)
-    for place, (i, j) in enumerate(pairs(unknowns)):
-        places[i, j] = places[j, i] = place
-    return places
+def square_indices(unknowns: int) -> np.ndarray:
+    """Index in a flat upper triangle of every entry of the full matrix."""
+    indices = np.zeros((unknowns, unknowns), int)
+    for index, (i, j) in enumerate(pairs(unknowns)):
+        indices[i, j] = indices[j, i] = index
+    return indices
 
 
 class Term(eqx.Module):
@@ -117,17 +124,19 @@ def _derive(
         unknowns, direct = (*ROTATION, *unknowns), [still] * len(ROTATION) + further
     arguments = [*q, *direct]
     if isinstance(observation, LocalUnknown):
-        local, free = observation.local(q, Further.of(iterate, further, tracker_to_image), images)
+        local, free = observation.local(
+            q, FurtherUnknowns.of(iterate, further, tracker_to_image), images
+        )
         arguments.append(local)
 
     def evaluate(*at: Array) -> list[Component]:
-        here, moved = list(at[:IN_IMAGE]), list(at[IN_IMAGE : IN_IMAGE + len(direct)])
+        here, moved = list(at[:Q_SIZE]), list(at[Q_SIZE : Q_SIZE + len(direct)])
         rotated = None
         if observation.oriented:
             # X turns by w, so directions in its frame turn back.
             rotated = unrolled.product(unrolled.rotation([-w for w in moved[:3]]), tracker_to_image)
             moved = moved[3:]
-        beside = Further.of(iterate, moved, rotated)
+        beside = FurtherUnknowns.of(iterate, moved, rotated)
         if isinstance(observation, LocalUnknown):
             return observation.components_at(here, at[-1], beside, images)
         return observation.components(here, beside, images)
@@ -271,12 +280,12 @@ def contributions(
 
     ``exact`` is the factor on the second derivatives of q; 0 for none. They are included by using
     A = [q]x' K + exact [g]x instead of [q]x' K: A M is then all of block (w, d), and A [q]x is
-    block (w, w) up to an antisymmetric part, which :func:`with_twist` takes from the summed
+    block (w, w) up to an antisymmetric part, which :func:`complete_curvature` takes from the summed
     gradient.
     """
-    unknowns = RIGID_UNKNOWNS + sum(place >= RIGID_UNKNOWNS for place in direct)
-    g = term.gradient[:IN_IMAGE]
-    k = [row[:IN_IMAGE] for row in term.curvature[:IN_IMAGE]]
+    unknowns = RIGID_UNKNOWNS + sum(index >= RIGID_UNKNOWNS for index in direct)
+    g = term.gradient[:Q_SIZE]
+    k = [row[:Q_SIZE] for row in term.curvature[:Q_SIZE]]
     lever = unrolled.cross(q)
     # K [q]x and K M; A = [q]x' K + exact [g]x; A [q]x, A M and M' K M.
     across, forth = unrolled.product(k, lever), unrolled.product(k, tracker_to_image)
@@ -307,25 +316,26 @@ def contributions(
     gradient = in_rigid(g) + [0] * (unknowns - RIGID_UNKNOWNS)
     # What depends on the unknowns directly, not through q.
     own: Vector = [0] * unknowns
-    for a, place in enumerate(direct, IN_IMAGE):
-        own[place] = term.gradient[a]
-        gradient[place] = unrolled.add(gradient[place], own[place])
-        column = in_rigid([term.curvature[i][a] for i in range(IN_IMAGE)])
+    for a, index in enumerate(direct, Q_SIZE):
+        own[index] = term.gradient[a]
+        gradient[index] = unrolled.add(gradient[index], own[index])
+        column = in_rigid([term.curvature[i][a] for i in range(Q_SIZE)])
         for i, entry in enumerate(column):
-            twice = unrolled.times(2, entry) if i == place else entry
-            row, col = sorted((i, place))
+            twice = unrolled.times(2, entry) if i == index else entry
+            row, col = sorted((i, index))
             full[row][col] = unrolled.add(full[row][col], twice)
-        for b, other in enumerate(direct[a - IN_IMAGE :], a):
-            full[place][other] = unrolled.add(full[place][other], term.curvature[a][b])
-    # with_twist takes the skew part of the whole gradient by w; the direct part has none: add it.
+        for b, other in enumerate(direct[a - Q_SIZE :], a):
+            full[index][other] = unrolled.add(full[index][other], term.curvature[a][b])
+    # complete_curvature takes off the skew part of the whole gradient by w. The direct part has
+    # none, so add it.
     kept = unrolled.cross([unrolled.times(0.5, unrolled.times(exact, own[k])) for k in ROTATION])
     for i, j in ((0, 1), (0, 2), (1, 2)):
         full[3 + i][3 + j] = unrolled.add(full[3 + i][3 + j], kept[i][j])
     return [full[i][j] for i, j in pairs(unknowns)], gradient
 
 
-def with_twist(flat: Vector, gradient: Vector, unknowns: int) -> Vector:
-    """Complete a flat curvature by q's second derivatives that follow from the summed gradient.
+def complete_curvature(flat: Vector, gradient: Vector, unknowns: int) -> Vector:
+    """A flat curvature with those second derivatives of q added that the summed gradient gives.
 
     Args:
         flat: sums of :func:`contributions`.
@@ -336,14 +346,14 @@ def with_twist(flat: Vector, gradient: Vector, unknowns: int) -> Vector:
     """
     twist = unrolled.cross([-value for value in gradient[:3]])
     skew = unrolled.cross([0.5 * value for value in gradient[3:6]])
-    flat, places = list(flat), pairs(unknowns)
+    flat, indices = list(flat), pairs(unknowns)
     for i in range(3):
         for j in range(3):
-            place = places.index((i, 3 + j))
-            flat[place] = unrolled.add(flat[place], twist[i][j])
+            index = indices.index((i, 3 + j))
+            flat[index] = unrolled.add(flat[index], twist[i][j])
             if j > i:
-                place = places.index((3 + i, 3 + j))
-                flat[place] = unrolled.add(flat[place], unrolled.times(-1, skew[i][j]))
+                index = indices.index((3 + i, 3 + j))
+                flat[index] = unrolled.add(flat[index], unrolled.times(-1, skew[i][j]))
     return flat
 
 
@@ -354,14 +364,14 @@ class NormalEquations(eqx.Module):
         curvature: upper triangle, in the order of :func:`pairs`.
         gradient: of half the cost.
         cost: sum of squared (whitened) residuals.
-        squares: |J_k|^2 of the unknowns' columns, where images have unknowns of their own and
-            eliminating these lowers the diagonal; None where the diagonal is |J_k|^2.
+        column_squares: |J_k|^2 of the unknowns' columns, where images have unknowns of their own
+            and eliminating these lowers the diagonal; None where the diagonal is |J_k|^2.
     """
 
     curvature: Float[Array, "triangle batch"]
     gradient: Float[Array, "p batch"]
     cost: Float[Array, " batch"]
-    squares: Float[Array, "p batch"] | None = None
+    column_squares: Float[Array, "p batch"] | None = None
 
     def stacked(self) -> Float[Array, "p p batch"]:
         """The full matrix as one array."""
@@ -369,19 +379,19 @@ class NormalEquations(eqx.Module):
 
     def diagonal(self) -> Float[Array, "p batch"]:
         """|J_k|^2 of every unknown: what damping and the gradient cosine are relative to."""
-        if self.squares is not None:
-            return self.squares
-        places = diagonal_places(self.gradient.shape[0])
-        return picked(self.curvature, np.array(places))
+        if self.column_squares is not None:
+            return self.column_squares
+        indices = diagonal_indices(self.gradient.shape[0])
+        return picked(self.curvature, np.array(indices))
 
 
 def stacked(flat: Float[Array, "triangle batch"]) -> Float[Array, "p p batch"]:
     """A symmetric matrix from its upper triangle."""
-    return picked(flat, square_places(int((2 * flat.shape[0]) ** 0.5)))
+    return picked(flat, square_indices(int((2 * flat.shape[0]) ** 0.5)))
 
 
-def diagonal_places(unknowns: int) -> tuple[int, ...]:
-    """Positions of the diagonal in a flat upper triangle."""
+def diagonal_indices(unknowns: int) -> tuple[int, ...]:
+    """Indices of the diagonal in a flat upper triangle."""
     return tuple(pairs(unknowns).index((k, k)) for k in range(unknowns))
 
 
@@ -417,11 +427,11 @@ def accumulate(
         bent = [_second_order(derived, k, images) for k in range(count)]
         gated = [wide * weight for weight in weights]
         term = Term(term.cost, term.gradient, _summed([term.curvature, *bent], [1, *gated]))
-    places = diagonal_places(iterate.unknowns)
+    indices = diagonal_indices(iterate.unknowns)
     columns: Vector = []
     if derived.free is not None:
         every, _ = contributions(q, tracker_to_image, _shared(whole), derived.unknowns, 0)
-        columns = [every[k] for k in places]
+        columns = [every[k] for k in indices]
         term = _eliminated(term, own_bend, derived.free)
     curvature, gradient = contributions(
         q, tracker_to_image, term, derived.unknowns, 0 if wide is None else wide
@@ -430,11 +440,11 @@ def accumulate(
     flat, gradient = sums[: len(curvature)], sums[len(curvature) : len(curvature) + len(gradient)]
     squares = sums[len(curvature) + len(gradient) :]
     if exact is not None:
-        twist = [exact * value for value in gradient[:6]]
-        flat = with_twist(flat, twist, iterate.unknowns)
+        pose_gradient = [exact * value for value in gradient[:6]]
+        flat = complete_curvature(flat, pose_gradient, iterate.unknowns)
     if medium is not None:
         for k, away, precision in medium.deviations(iterate):
-            flat[places[k]] = flat[places[k]] + precision
+            flat[indices[k]] = flat[indices[k]] + precision
             gradient[k] = gradient[k] + precision * away
             cost = cost + precision * away * away
     lengths = jnp.stack(squares) if squares else None
@@ -468,9 +478,9 @@ def information_and_design(
     sums = total(planes)
     flat, design = sums[: len(sums) // 2], sums[len(sums) // 2 :]
     if medium is not None:
-        places = diagonal_places(iterate.unknowns)
+        indices = diagonal_indices(iterate.unknowns)
         for k, _, precision in medium.deviations(iterate):
-            flat[places[k]] = flat[places[k]] + precision
+            flat[indices[k]] = flat[indices[k]] + precision
     return stacked(unrolled.as_array(flat)), stacked(unrolled.as_array(design))
 
 
@@ -499,9 +509,9 @@ class ComponentSums(eqx.Module):
         cost = jnp.sum(weight * self.squares, axis=0)
         if self.prior is not None:
             away, slope, diagonal = self.prior
-            rows, places = unrolled.rows_of(flat), diagonal_places(slope.shape[0])
-            for place, entry in zip(places, diagonal, strict=True):
-                rows[place] = rows[place] + entry
+            rows, indices = unrolled.rows_of(flat), diagonal_indices(slope.shape[0])
+            for index, entry in zip(indices, diagonal, strict=True):
+                rows[index] = rows[index] + entry
             flat, gradient, cost = jnp.stack(rows), gradient + slope, cost + away
         return NormalEquations(flat, gradient, cost)
 
@@ -545,8 +555,8 @@ def component_sums(
     if sigma is None:
         rest = [jnp.zeros_like(squares[0])] * len(pairs(unknowns))
     else:
-        twist = jnp.sum((1 / sigma**2)[:, None] * gradient[:, :6], axis=0)
-        rest = with_twist(sums[count * each :], unrolled.rows_of(twist), unknowns)
+        pose_gradient = jnp.sum((1 / sigma**2)[:, None] * gradient[:, :6], axis=0)
+        rest = complete_curvature(sums[count * each :], unrolled.rows_of(pose_gradient), unknowns)
     known = None
     if medium is not None:
         zero = jnp.zeros_like(squares[0])

@@ -41,8 +41,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxcal.model import unrolled
-from jaxcal.model.batch import RIGID_UNKNOWNS, ImagePlanes, Iterate, targets
-from jaxcal.model.observations import Further, Observation
+from jaxcal.model.batch import ImagePlanes, Iterate, targets
+from jaxcal.model.observations import FurtherUnknowns, Observation
+from jaxcal.model.unknowns import RIGID_UNKNOWNS
 from jaxcal.model.unrolled import Vector
 from jaxcal.solvers.normal_equations import over_elements, weight_of
 
@@ -138,7 +139,7 @@ def influences(
         return [*rigid, *rows[RIGID_UNKNOWNS:-1]]
 
     def residuals(*at: Array) -> list[Vector]:
-        beside = Further.of(iterate, list(at[len(q) :]))
+        beside = FurtherUnknowns.of(iterate, list(at[len(q) :]))
         return [each.errors for each in observation.components(list(at[: len(q)]), beside, images)]
 
     still = jnp.zeros_like(mean)[:, None]
@@ -148,7 +149,7 @@ def influences(
     values[-1] = [values[-1][0] - mean[:, None]]
     to_minimum[-1] = [to_minimum[-1][0] - step[-1][:, None]]
     slopes[-1] = [slopes[-1][0] - along[-1][:, None]]
-    parts = observation.components(q, Further.of(iterate, here[len(q) :]), images)
+    parts = observation.components(q, FurtherUnknowns.of(iterate, here[len(q) :]), images)
     total = share = jnp.zeros_like(images.mask)
 
     for k, part in enumerate(parts):

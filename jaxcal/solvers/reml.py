@@ -47,8 +47,8 @@ from jaxcal.solvers.levenberg_marquardt import (
     LARGEST_DAMPING,
     LEAST_DAMPING,
     MOST_STALLED,
-    Judged,
     Rounding,
+    StepJudgement,
     damped_step,
     default_tolerance,
     empty_trace,
@@ -230,11 +230,11 @@ def updated(
     ridge = 16 * jnp.finfo(count.dtype).eps * jnp.where(diagonal > 0, diagonal, 1.0)
     eye = jnp.eye(len(diagonal), dtype=diagonal.dtype)[..., None]
     inverse, _ = dense.inverse_batch_last(stacked(normal.curvature) + eye * ridge)
-    places = pairs(len(diagonal))
-    twice = np.array([1 if i == j else 2 for i, j in places], diagonal.dtype)[:, None]
+    entries = pairs(len(diagonal))
+    twice = np.array([1 if i == j else 2 for i, j in entries], diagonal.dtype)[:, None]
 
     def flat(matrix: Float[Array, "p p batch"]) -> Float[Array, "triangle batch"]:
-        rows, columns = (np.array(each) for each in zip(*places, strict=True))
+        rows, columns = (np.array(each) for each in zip(*entries, strict=True))
         return barrier(twice * matrix[rows, columns])
 
     leverage = jnp.sum(flat(inverse) * sums.matrix, axis=1)
@@ -312,7 +312,7 @@ class Tuning(eqx.Module):
             predicted=predicted,
         )
 
-    def judge(self, state: SelfTuned, sums: ComponentSums, rounding: Rounding) -> Judged:
+    def judge(self, state: SelfTuned, sums: ComponentSums, rounding: Rounding) -> StepJudgement:
         """Whether the step to the candidate is accepted."""
         # New SDs may change the units of the residuals, and so the cost, without any step.
         whitened = sums.squares / state.step_sigma**2
@@ -358,7 +358,7 @@ class Tuning(eqx.Module):
     def next_state(
         self,
         state: SelfTuned,
-        judged: Judged,
+        judged: StepJudgement,
         found: Proposal,
         iterate: Iterate,
         sigma: Float[Array, "k batch"],

@@ -42,7 +42,7 @@ from jaxcal.model.unknowns import FURTHER, TABLE, Blocks
 from jaxcal.runtime.compiler import traced_once
 from jaxcal.solvers import dense
 from jaxcal.solvers.closed_form.single import Start
-from jaxcal.solvers.levenberg_marquardt import Descent, minimise
+from jaxcal.solvers.levenberg_marquardt import Minimum, minimise
 
 LEAST_PIVOT = 1e-10
 """Least pivot of the normal matrix, scaled to a unit diagonal, with which a start is sound."""
@@ -57,7 +57,7 @@ class ConventionalStart(eqx.Module):
         searched: whether a start had to be searched for.
     """
 
-    fit: Descent
+    fit: Minimum
     start: Iterate
     searched: Bool[Array, " batch"]
 
@@ -102,9 +102,10 @@ class Reduced(eqx.Module):
         squares: sums of squares of lateral position and range, mm^2.
         moments: sums of lateral times R_i and of range times R_i, side by side, mm.
         rotation: sum of R_i.
-        pulled: sum of R_i'(centre - b_i), mm.
-        spread: inverse of t's normal matrix, c eliminated.
-        least: smallest share of t's diagonal entries that eliminating c and the rest of t leaves.
+        centre_in_probes: sum of R_i'(centre - b_i), the centre in the probes' frames, mm.
+        origin_covariance: covariance of t for errors of variance 1, c eliminated.
+        smallest_pivot: smallest share of t's diagonal entries that is left when c and the rest of
+            t are eliminated.
     """
 
     count: Float[Array, " batch"]
@@ -116,9 +117,9 @@ class Reduced(eqx.Module):
     squares: Float[Array, "2 batch"]
     moments: Float[Array, "3 6 batch"]
     rotation: Float[Array, "3 3 batch"]
-    pulled: Float[Array, "3 batch"]
-    spread: Float[Array, "3 3 batch"]
-    least: Float[Array, " batch"]
+    centre_in_probes: Float[Array, "3 batch"]
+    origin_covariance: Float[Array, "3 3 batch"]
+    smallest_pivot: Float[Array, " batch"]
 
     @classmethod
     def of(cls, images: ImagePlanes) -> Reduced:
@@ -147,20 +148,20 @@ class Reduced(eqx.Module):
         eye = jnp.eye(3, dtype=x.dtype)[..., None]
         ridge = 2e-12 + 32 * jnp.finfo(x.dtype).eps
         own = barrier(count * (1 + ridge) * eye - squared(rotation, rotation))
-        spread, _ = dense.inverse_batch_last(own)
+        origin_covariance, _ = dense.inverse_batch_last(own)
         mixed = squared(rotation, moments)
-        follows = barrier(dense.product_batch_last(spread, mixed))
+        follows = barrier(dense.product_batch_last(origin_covariance, mixed))
         back_from_t = jnp.swapaxes(mixed, 0, 1)
         # S (x) I: sums of squares and products of the points' coordinates.
         square = jnp.stack([jnp.stack(sums[:2]), jnp.stack(sums[1:3])])
         whole = square[:, None, :, None] * eye[None, :, None]
         matrix = whole.reshape(6, 6, -1) - squared(moments, moments)
         matrix = barrier(matrix - dense.product_batch_last(back_from_t, follows))
-        pulled = parts[2, 9:]
+        centre_in_probes = parts[2, 9:]
         rhs = parts[:2, 9:].reshape(6, -1)
-        rhs = rhs + dense.product_batch_last(jnp.swapaxes(follows, 0, 1), pulled)
+        rhs = rhs + dense.product_batch_last(jnp.swapaxes(follows, 0, 1), centre_in_probes)
         squares = jnp.stack([sums[0], sums[2]])
-        left = jnp.stack([count * spread[k, k] for k in range(3)])
+        left = jnp.stack([count * origin_covariance[k, k] for k in range(3)])
         return cls(
             count,
             jnp.stack(mean),
@@ -171,8 +172,8 @@ class Reduced(eqx.Module):
             squares,
             moments,
             rotation,
-            pulled,
-            spread,
+            centre_in_probes,
+            origin_covariance,
             1 / jnp.max(left, axis=0),
         )
 
@@ -193,7 +194,9 @@ class Reduced(eqx.Module):
         columns = jnp.concatenate([scale[0] * lateral, scale[1] * axial])
         seen = dense.product_batch_last(self.moments, columns)
         pull = dense.product_batch_last(jnp.swapaxes(self.rotation, 0, 1), seen) / self.count
-        of_mean = barrier(dense.product_batch_last(self.spread, self.pulled + pull))
+        of_mean = barrier(
+            dense.product_batch_last(self.origin_covariance, self.centre_in_probes + pull)
+        )
         target = seen + dense.product_batch_last(self.rotation, of_mean)
         depth = scale[1] * (self.mean[1] - self.face) + self.face
         free = {name: [TABLE[name].nominal * one] * TABLE[name].size for name in FURTHER}
@@ -239,12 +242,12 @@ def closed_form(
     inverse, _ = dense.inverse_batch_last(sums.matrix)
     columns = barrier(dense.product_batch_last(inverse, sums.rhs))
     left = jnp.stack([sums.squares[k // 3] * inverse[k, k] for k in range(6)])
-    least = jnp.minimum(sums.least, 1 / jnp.max(left, axis=0))
+    smallest_pivot = jnp.minimum(sums.smallest_pivot, 1 / jnp.max(left, axis=0))
     a, b = columns[:3], columns[3:]
     long, deep = jnp.sqrt(jnp.sum(a * a, axis=0)), jnp.sqrt(jnp.sum(b * b, axis=0))
     cosine = jnp.abs(jnp.sum(a * b, axis=0)) / (long * deep)
     # Comparisons with NaN are false, so a start with NaN is not sound.
-    sound = (least > LEAST_PIVOT) & (cosine < 0.5)
+    sound = (smallest_pivot > LEAST_PIVOT) & (cosine < 0.5)
     for size_of in (long, deep):
         known = (size_of > 0.5) & (size_of < 2.0)
         sound = sound & ((size_of > 0) if "scale" in blocks else known)

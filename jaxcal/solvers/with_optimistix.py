@@ -14,7 +14,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxcal.model.batch import ImagePlanes, Iterate, choose, targets
-from jaxcal.model.observations import Further, MediumPrior, Observation
+from jaxcal.model.observations import FurtherUnknowns, MediumPrior, Observation
 from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
 from jaxcal.runtime.compiler import traced_once
 from jaxcal.solvers.levenberg_marquardt import Rounding, empty_trace, gradient_cosine
@@ -81,7 +81,7 @@ def whitened_residuals(
     """All residuals of every problem in SDs, zeros where an image is left out; batch axis last."""
     q, tracker_to_image = targets(iterate, images)
     parts = []
-    found = observation.components(q, Further.at(iterate, tracker_to_image), images)
+    found = observation.components(q, FurtherUnknowns.at(iterate, tracker_to_image), images)
     for component, sd in zip(found, observation.sigma, strict=True):
         for error in component.errors:
             white = weight_of(component, images) * error / sd.reshape(-1, *(1,) * (error.ndim - 1))

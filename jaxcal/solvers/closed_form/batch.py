@@ -150,16 +150,16 @@ def solve_traceable(problems: Problem, estimate: tuple[str, ...]) -> ClosedForm:
     # Whole poses, and R'b plane by plane: batched products of 3x3 matrices are slow.
     flat = used.poses.reshape(*mask.shape, 16)
     sums = jnp.einsum("bnk,bnf->bkf", weights, flat).reshape(-1, 3, 4, 4)
-    turned = sums[:, :, :3, :3]
+    rotation_sums = sums[:, :, :3, :3]
     back = [sum(rotations[:, :, i, j] * away[:, :, i] for i in range(3)) for j in range(3)]
-    pulled = jnp.einsum("bnk,bnj->bkj", weights, jnp.stack(back, axis=2))
-    spread = jnp.einsum("bnk,bnl->bkl", deviation, deviation)
-    size = jnp.sum(away**2, axis=(1, 2)) + spread[:, 0, 0] + spread[:, 1, 1]
+    origin_sums = jnp.einsum("bnk,bnj->bkj", weights, jnp.stack(back, axis=2))
+    scatter = jnp.einsum("bnk,bnl->bkl", deviation, deviation)
+    size = jnp.sum(away**2, axis=(1, 2)) + scatter[:, 0, 0] + scatter[:, 1, 1]
 
     full, rhs = _normal(
-        jnp.moveaxis(spread, 0, -1),
-        jnp.moveaxis(turned, 0, -1),
-        jnp.moveaxis(pulled, 0, -1),
+        jnp.moveaxis(scatter, 0, -1),
+        jnp.moveaxis(rotation_sums, 0, -1),
+        jnp.moveaxis(origin_sums, 0, -1),
         count,
     )
     matrix, vector, origin = _eliminate(full, rhs)
@@ -209,23 +209,25 @@ def solve_traceable(problems: Problem, estimate: tuple[str, ...]) -> ClosedForm:
     )
 
 
-def _normal(spread: Array, turned: Array, pulled: Array, count: Array) -> tuple[Matrix, Vector]:
+def _normal(
+    scatter: Array, rotation_sums: Array, origin_sums: Array, count: Array
+) -> tuple[Matrix, Vector]:
     """Normal equations of (a1, a3, t), c eliminated, as matrix and right side; batch axis last."""
     size = 9
     full: Matrix = [[0] * size for _ in range(size)]
     for a in range(2):
         for b in range(2):
             for i in range(3):
-                full[3 * a + i][3 * b + i] = spread[a, b]
+                full[3 * a + i][3 * b + i] = scatter[a, b]
     for i in range(3):
         full[6 + i][6 + i] = count
-    columns = [[turned[k, i, j] for k in range(3) for j in range(3)] for i in range(3)]
+    columns = [[rotation_sums[k, i, j] for k in range(3) for j in range(3)] for i in range(3)]
     inverse = 1 / count
     for p in range(size):
         for q in range(p, size):
             taken = sum(columns[i][p] * columns[i][q] for i in range(3)) * inverse
             full[p][q] = full[q][p] = unrolled.add(full[p][q], -taken)
-    return full, [-pulled[k, j] for k in range(3) for j in range(3)]
+    return full, [-origin_sums[k, j] for k in range(3) for j in range(3)]
 
 
 def _eliminate(full: Matrix, rhs: Vector) -> tuple[Array, Array, Any]:
