@@ -60,7 +60,7 @@ def test_images_masked_by_the_caller_stay_out(consensus):
     mask[:, 20:30] = 0.0
     found = consensus(replace(spoilt, mask=jnp.asarray(mask)))
     assert not np.asarray(found.keep)[:, 20:30].any()
-    assert not np.asarray(found.departure)[:, 20:30].any()
+    assert not np.asarray(found.studentised_errors)[:, 20:30].any()
     np.testing.assert_array_equal(found.keep, mask * (1 - np.asarray(outlier)))
 
 

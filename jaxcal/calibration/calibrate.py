@@ -156,8 +156,8 @@ def calibrate(
         robust: first find the images that agree with each other, even if nearly half of all images
             are wrong (:mod:`jaxcal.solvers.consensus`), and leave the others out. Many images that
             are wrong in the same way, by a few mm (a mount that slipped), agree with each other and
-            may stay. ``outlier`` and ``departure`` say which and why. If no image has a gross
-            error, none is left out, and the answer is the same as without ``robust``.
+            may stay. ``outlier`` and ``studentised_errors`` say which and why. If no image has a
+            gross error, none is left out, and the answer is the same as without ``robust``.
 
     Returns:
         A :class:`Calibration`; read its ``status`` and ``warnings`` before using it. The frames of

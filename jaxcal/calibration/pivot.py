@@ -24,7 +24,7 @@ from jaxcal.calibration.answer import covariance_and_observability
 from jaxcal.data.poses import check_poses
 from jaxcal.data.problem import Problem
 from jaxcal.data.recording import LEAST_REACH_MM, MINIMUM_IMAGES, MetresError
-from jaxcal.diagnostics.outliers import listed_departures, outliers
+from jaxcal.diagnostics.outliers import listed_outliers, outliers
 from jaxcal.diagnostics.uncertainty import LARGEST_SD, Spectra
 from jaxcal.model.parameters import Parameters, retract
 from jaxcal.model.residuals import target_in_image
@@ -37,14 +37,14 @@ from jaxcal.solvers import dense
 from jaxcal.solvers.consensus import (
     FEWEST_IMAGES,
     ConsensusModel,
-    departures,
     find_consensus,
     stands_out,
+    studentised_errors,
 )
 
 BLOCKS = ("translation", "point")
 AXES = ("x", "y", "z")
-"""Axes of the tool's frame, along which the components of a departure are."""
+"""Axes of the tool's frame, along which the components of an error are."""
 _SUBSET = 4
 _LARGEST_RMS_MM = 5.0
 """A tip that stays in a dimple does not move by so much."""
@@ -64,7 +64,7 @@ class Pivot(eqx.Module):
         residual: those errors in the tool's frame, mm; 0 where not used.
         mask: 1 for used poses.
         outlier: 1 where a pose does not fit the rest; a robust solve leaves it out.
-        departure: errors of all poses, in robust SDs of the used poses' errors.
+        studentised_errors: errors of all poses, in robust SDs of the used poses' errors.
         status_code: a :class:`jaxcal.result.calibration.Status`.
         information: of (tip, point) for errors with an SD of 1 mm.
         robust: poses that do not fit the rest were left out (static).
@@ -78,7 +78,7 @@ class Pivot(eqx.Module):
     residual: Float[Array, "*batch n 3"]
     mask: Float[Array, "*batch n"]
     outlier: Float[Array, "*batch n"]
-    departure: Float[Array, "*batch n 3"]
+    studentised_errors: Float[Array, "*batch n 3"]
     status_code: Int[Array, "*batch"]
     information: Float[Array, "*batch 6 6"]
     robust: bool = eqx.field(static=True, default=True)
@@ -160,7 +160,7 @@ class Pivot(eqx.Module):
                 )
         named = outliers(self)
         if named:
-            told = listed_departures(self, AXES)
+            told = listed_outliers(self, AXES)
             verb = "left out" if self.robust else "kept"
             found.append(f"{verb} {len(named)} poses that do not fit the rest: {told}")
         return found
@@ -302,11 +302,11 @@ def _solve(poses: Float[Array, "n 4 4"], mask: Float[Array, " n"], *, robust: bo
     _, gradient = _normal(parameters, problem)
     step = dense.solve_symmetric(information, gradient, diagonal)
     parameters = retract(parameters, -step, BLOCKS)
-    _, departure = departures(parameters, everything, keep, model)
+    _, studentised = studentised_errors(parameters, everything, keep, model)
     outlier = mask * (1 - keep)
     if not robust:
         judged = jnp.sum(mask) >= FEWEST_IMAGES
-        outlier = mask * judged * stands_out(departure, keep)
+        outlier = mask * judged * stands_out(studentised, keep)
     residual = _errors(parameters, problem)
     used = jnp.sum(keep)
     variance = jnp.sum(residual**2) / jnp.maximum(3 * used - 6, 1.0)
@@ -332,7 +332,7 @@ def _solve(poses: Float[Array, "n 4 4"], mask: Float[Array, " n"], *, robust: bo
         residual=residual,
         mask=keep,
         outlier=outlier,
-        departure=departure,
+        studentised_errors=studentised,
         status_code=jnp.where(failed, Status.FAILED, status).astype(jnp.int32),
         information=information,
         robust=robust,

@@ -39,8 +39,8 @@ class HasOutliers(Protocol):
         ...
 
     @property
-    def departure(self) -> AnyArray:
-        """(n, 3) errors of each image in SDs."""
+    def studentised_errors(self) -> AnyArray:
+        """(n, 3) errors of each image in SDs, corrected for leverage."""
         ...
 
     @property
@@ -62,21 +62,21 @@ def outlier_reasons(
     The keys are ``image``, ``component`` (a name from ``components``), ``sds`` (signed) and
     ``left_out``.
     """
-    departure = np.asarray(result.departure, dtype=float)
+    studentised = np.asarray(result.studentised_errors, dtype=float)
     found: list[OutlierReason] = []
     for image in outliers(result):
-        worst = int(np.argmax(np.abs(departure[image])))
+        worst = int(np.argmax(np.abs(studentised[image])))
         reason: OutlierReason = {
             "image": image,
             "component": components[worst],
-            "sds": finite_or_none(departure[image, worst]),
+            "sds": finite_or_none(studentised[image, worst]),
             "left_out": bool(np.asarray(result.mask)[image] == 0),
         }
         found.append(reason)
     return found
 
 
-def listed_departures(result: HasOutliers, components: tuple[str, ...] = COMPONENTS) -> str:
+def listed_outliers(result: HasOutliers, components: tuple[str, ...] = COMPONENTS) -> str:
     """The first ten outliers with component and SDs, in words."""
     reasons = outlier_reasons(result, components)
     told = [

@@ -1,6 +1,6 @@
 """Checks of the residuals: outliers, the fit of the noise model, and which poses to add.
 
-*Images.* Each image's departure from the fit to the images in use, in robust SDs. Lateral errors of
+*Images.* Each image's errors under the fit to the images in use, in robust SDs. Lateral errors of
 deep images count less, since an array's lateral errors grow with the range
 (:mod:`jaxcal.solvers.consensus`).
 
@@ -62,12 +62,14 @@ def inspect(
         eps: relative rounding of the arithmetic that solved them.
     """
     kept = np.asarray(answer.mask, float)
-    departure = departures(seen, kept, eps)
+    studentised = studentised_errors(seen, kept, eps)
     if answer.robust:
         outlier = seen.mask * (1 - kept)
     else:
-        judged = (seen.mask.sum(axis=1) >= FEWEST_IMAGES) & np.isfinite(departure).all(axis=(1, 2))
-        outlier = seen.mask * judged[:, None] * stands_out(departure, kept)
+        judged = (seen.mask.sum(axis=1) >= FEWEST_IMAGES) & np.isfinite(studentised).all(
+            axis=(1, 2)
+        )
+        outlier = seen.mask * judged[:, None] * stands_out(studentised, kept)
     residual = seen.errors
     if answer.prior in TUNED and answer.data == "points":
         whitened = Whitened.of(answer, shifted)
@@ -75,12 +77,14 @@ def inspect(
         residual = whitened.errors / np.sqrt(left)
     kurtosis, misfit = check_noise_model(residual, seen.distance, kept)
     gain = gains(answer, seen, uncertainty)
-    at_place = range_at_place(departure[..., 1], seen, kept)
-    return Inspection(outlier, departure, at_place, kurtosis, misfit, gain)
+    at_place = range_at_place(studentised[..., 1], seen, kept)
+    return Inspection(outlier, studentised, at_place, kurtosis, misfit, gain)
 
 
-def departures(seen: ImageErrors, kept: Float[Array, "k n"], eps: float) -> Float[Array, "k n 3"]:
-    """Every image's departure from the fit to the kept ones, in robust SDs, leverage included."""
+def studentised_errors(
+    seen: ImageErrors, kept: Float[Array, "k n"], eps: float
+) -> Float[Array, "k n 3"]:
+    """Every image's errors under the fit to the kept ones, in robust SDs, leverage corrected."""
     blocks, problem = seen.blocks, seen.problem
     rigid = [name for name in blocks if name in ("translation", "rotation", "point", "scale")]
     columns = np.concatenate([np.r_[block_slice(blocks, name)] for name in rigid])
@@ -106,25 +110,25 @@ def departures(seen: ImageErrors, kept: Float[Array, "k n"], eps: float) -> Floa
 
 
 def range_at_place(
-    departure: Float[Array, "k n"], seen: ImageErrors, kept: Float[Array, "k n"]
+    studentised: Float[Array, "k n"], seen: ImageErrors, kept: Float[Array, "k n"]
 ) -> Float[Array, "k n"]:
     """Range errors in robust SDs of errors at the target's place in the image.
 
     Args:
-        departure: the same in robust SDs of all images.
+        studentised: the same in robust SDs of all images.
         seen: the images.
         kept: 1 for images in use.
     """
-    found = np.zeros_like(departure)
-    judged = (kept.sum(axis=1) >= FEWEST_TO_CHECK) & np.isfinite(departure).all(axis=1)
-    errors, mask = departure[judged], kept[judged]
+    found = np.zeros_like(studentised)
+    judged = (kept.sum(axis=1) >= FEWEST_TO_CHECK) & np.isfinite(studentised).all(axis=1)
+    errors, mask = studentised[judged], kept[judged]
     found[judged] = mask * errors / relative_sd(seen.q[judged], errors, mask)
 
     def typical(values: Float[Array, "k n"]) -> Float[Array, " k"]:
         return medians(np.abs(values)[..., None], kept)[:, 0]
 
     now = typical(found)
-    by = np.where(judged & (now > 0), typical(departure) / np.where(now > 0, now, 1.0), 1.0)
+    by = np.where(judged & (now > 0), typical(studentised) / np.where(now > 0, now, 1.0), 1.0)
     return found * by[:, None]
 
 
@@ -136,8 +140,8 @@ def medians(values: Float[Array, "k n c"], weight: Float[Array, "k n"]) -> Float
     return np.take_along_axis(np.sort(values, axis=1), middle[:, None, None], axis=1)[:, 0]
 
 
-def stands_out(departure: Float[Array, "k n 3"], kept: Float[Array, "k n"]) -> Bool[Array, "k n"]:
-    """Whether an image departs by more than the images in use can explain.
+def stands_out(studentised: Float[Array, "k n 3"], kept: Float[Array, "k n"]) -> Bool[Array, "k n"]:
+    """Whether an image's errors are larger than the images in use can explain.
 
     A median of a dozen images is itself uncertain, so the limit is wider with few images. It is not
     widened for images that were left out (:func:`jaxcal.solvers.consensus.stands_out`).
@@ -145,7 +149,7 @@ def stands_out(departure: Float[Array, "k n 3"], kept: Float[Array, "k n"]) -> B
     count = np.maximum(kept.sum(axis=1, keepdims=True), 1.0)
     few = np.sqrt(np.maximum(FEW_IMAGES / count, 1.0))
     limit = CUT * np.where(kept > 0, few, 1.0)
-    return np.any(np.abs(departure) > limit[..., None], axis=2)
+    return np.any(np.abs(studentised) > limit[..., None], axis=2)
 
 
 def check_noise_model(

@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxcal.diagnostics.directions import check_one, observability
 from jaxcal.diagnostics.misfits import misfits
-from jaxcal.diagnostics.outliers import listed_departures, outliers, suspects_in_words
+from jaxcal.diagnostics.outliers import listed_outliers, outliers, suspects_in_words
 from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
 from jaxcal.solvers.plan import TUNED
 
@@ -154,7 +154,7 @@ def _misfitting_images(result: Calibration) -> list[str]:
     named = outliers(result)
     if not named:
         return []
-    listed = listed_departures(result)
+    listed = listed_outliers(result)
     if result.robust:
         count = len(named) + int(result.images_used)
         return [f"left out {len(named)} of {count} images that do not fit the rest: {listed}"]

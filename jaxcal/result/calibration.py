@@ -330,9 +330,12 @@ class Calibration:
         return self._summary.inspection.outlier
 
     @property
-    def departure(self) -> Float[np.ndarray, "*batch n 3"]:
-        """Each image's lateral, range and elevational errors in robust SDs of the used images."""
-        return self._summary.inspection.departure
+    def studentised_errors(self) -> Float[np.ndarray, "*batch n 3"]:
+        """Each image's lateral, range and elevational errors, in robust SDs of the used images.
+
+        They are corrected for leverage.
+        """
+        return self._summary.inspection.studentised_errors
 
     @cached_property
     def wrong_frames(self) -> str | None:

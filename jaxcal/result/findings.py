@@ -23,8 +23,8 @@ class Inspection:
 
     Attributes:
         outlier: 1 where an image does not fit the rest.
-        departure: errors of lateral position, range and elevational offset in robust SDs of the
-            images in use; 0 where the caller masked the image.
+        studentised_errors: errors of lateral position, range and elevational offset in robust SDs
+            of the images in use, corrected for leverage; 0 where the caller masked the image.
         range_at_place: range errors of the images in use, in robust SDs of errors at the target's
             place in the image; 0 with fewer than 20 images in use.
         kurtosis: of the standardised residuals; 3 for Gaussian ones.
@@ -35,7 +35,7 @@ class Inspection:
     """
 
     outlier: Float[Array, "*batch n"]
-    departure: Float[Array, "*batch n 3"]
+    studentised_errors: Float[Array, "*batch n 3"]
     range_at_place: Float[Array, "*batch n"]
     kurtosis: Float[Array, "*batch 3"]
     misfit: Float[Array, "*batch 5 3"]

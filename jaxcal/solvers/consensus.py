@@ -89,13 +89,13 @@ class Consensus(eqx.Module):
         keep: (n,) 1 for used images that agree, 0 otherwise.
         parameters: the unknowns fitted to these images by a few Gauss-Newton steps.
         sigma: (3,) SDs of the components over the images that agree, mm.
-        departure: (n, 3) errors in SDs, corrected for leverage; 0 for images masked out.
+        studentised_errors: (n, 3) errors in SDs, corrected for leverage; 0 for images masked out.
     """
 
     keep: Float[Array, " n"]
     parameters: Parameters
     sigma: Float[Array, 3]
-    departure: Float[Array, "n 3"]
+    studentised_errors: Float[Array, "n 3"]
 
 
 def rigid_model(blocks: Blocks) -> ConsensusModel:
@@ -118,7 +118,7 @@ def steadied_errors(parameters: Parameters, problem: Problem) -> Float[Array, "n
 
 
 def find_consensus(problem: Problem, model: ConsensusModel) -> Consensus:
-    """Find the images that agree, and how far every image departs from them.
+    """Find the images that agree, and every image's errors under the fit to them.
 
     Args:
         problem: one problem; images masked out stay out.
@@ -147,7 +147,7 @@ def find_consensus(problem: Problem, model: ConsensusModel) -> Consensus:
     found: Consensus = jax.tree.map(lambda leaf: leaf[winner], finished)
     enough = (jnp.sum(used) >= FEWEST_IMAGES) & jnp.isfinite(cost[winner])
     return Consensus(
-        jnp.where(enough, found.keep, used), found.parameters, found.sigma, found.departure
+        jnp.where(enough, found.keep, used), found.parameters, found.sigma, found.studentised_errors
     )
 
 
@@ -177,10 +177,10 @@ def _finish(
         leverage = _leverage(jacobian, sigma, basis)
         squared = jnp.sum((errors / sigma) ** 2, axis=1)
         nearest = used * (squared <= quantile(squared, used, CONCENTRATION))
-        departure = _studentised(errors, leverage, sigma, basis)
-        fits = used * (1 - stands_out(departure, basis))
+        studentised = _studentise(errors, leverage, sigma, basis)
+        fits = used * (1 - stands_out(studentised, basis))
         # If fewer than ``fewest`` fit, go on with the images that stand out least.
-        largest = jnp.max(jnp.abs(departure), axis=1)
+        largest = jnp.max(jnp.abs(studentised), axis=1)
         least = used * (largest <= quantile(largest, used, fewest / jnp.sum(used)))
         fits = jnp.where(jnp.sum(fits) >= fewest, fits, least)
         weight = jnp.where(concentrating, nearest, fits)
@@ -194,22 +194,22 @@ def _finish(
     errors, jacobian = _linearise(parameters, problem, model)
     leverage = _leverage(jacobian, _robust(errors, keep, model), keep)
     sigma, freedom = _efficient(errors, leverage, keep, model)
-    departure = _studentised(errors, leverage, sigma, keep)
+    studentised = _studentise(errors, leverage, sigma, keep)
     # For images in use: the cost of three Gaussian errors each, less the freedom of the fitted
     # unknowns. For an image left out: each of its errors is as predicted or may be anything.
     cost = jnp.sum(freedom * jnp.log(jnp.sqrt(2 * jnp.pi * jnp.e) * sigma))
-    predicted = 0.5 * departure**2 + jnp.log(jnp.sqrt(2 * jnp.pi * (1 + leverage)) * sigma)
+    predicted = 0.5 * studentised**2 + jnp.log(jnp.sqrt(2 * jnp.pi * (1 + leverage)) * sigma)
     wrong = jnp.sum(jnp.minimum(predicted, jnp.log(ANYTHING_MM)), axis=1) - jnp.log(WRONG)
     cost = cost + jnp.sum(jnp.where((used > 0) & (keep == 0), wrong, 0.0))
-    sound = (jnp.sum(keep) >= fewest) & jnp.all(jnp.isfinite(departure))
+    sound = (jnp.sum(keep) >= fewest) & jnp.all(jnp.isfinite(studentised))
     cost = jnp.where(sound & jnp.isfinite(cost), cost, jnp.inf)
-    return Consensus(keep, parameters, sigma, departure), cost
+    return Consensus(keep, parameters, sigma, studentised), cost
 
 
-def departures(
+def studentised_errors(
     parameters: Parameters, problem: Problem, keep: Float[Array, " n"], model: ConsensusModel
 ) -> tuple[Float[Array, 3], Float[Array, "n 3"]]:
-    """How far every image departs from the fit to the kept ones.
+    """Every image's errors under the fit to the kept ones.
 
     Args:
         parameters: fitted to the kept images.
@@ -219,15 +219,15 @@ def departures(
 
     Returns:
         sigma: (3,) robust SDs of the kept images' errors, mm.
-        departure: (n, 3) errors in SDs, corrected for leverage; 0 for images masked out.
+        studentised_errors: (n, 3) errors in SDs, corrected for leverage; 0 for images masked out.
     """
     errors, jacobian = _linearise(parameters, problem, model)
     sigma = _robust(errors, keep, model)
-    return sigma, _studentised(errors, _leverage(jacobian, sigma, keep), sigma, keep)
+    return sigma, _studentise(errors, _leverage(jacobian, sigma, keep), sigma, keep)
 
 
-def stands_out(departure: Float[Array, "n 3"], keep: Float[Array, " n"]) -> Float[Array, " n"]:
-    """1 where an image departs by more than the images in use can explain.
+def stands_out(studentised: Float[Array, "n 3"], keep: Float[Array, " n"]) -> Float[Array, " n"]:
+    """1 where an image's errors are larger than the images in use can explain.
 
     A median of a dozen images is itself uncertain, so the limit is wider with few images. It is
     not wider for an image that was left out: the prediction from few images is uncertain, too, and
@@ -235,7 +235,7 @@ def stands_out(departure: Float[Array, "n 3"], keep: Float[Array, " n"]) -> Floa
     """
     few = jnp.sqrt(jnp.maximum(FEW_IMAGES / jnp.maximum(jnp.sum(keep), 1.0), 1.0))
     limit = CUT * jnp.where(keep > 0, few, 1.0)
-    return jnp.any(jnp.abs(departure) > limit[:, None], axis=1).astype(keep.dtype)
+    return jnp.any(jnp.abs(studentised) > limit[:, None], axis=1).astype(keep.dtype)
 
 
 def _robust(
@@ -265,7 +265,7 @@ def _efficient(
     return _with_floor(jnp.sqrt(squares / freedom)), freedom
 
 
-def _studentised(
+def _studentise(
     errors: Float[Array, "n 3"],
     leverage: Float[Array, "n 3"],
     sigma: Float[Array, 3],
@@ -357,5 +357,5 @@ def quantile(
 
 
 def _with_floor(sigma: Float[Array, 3]) -> Float[Array, 3]:
-    """No SD below a fiftieth of the largest: smaller departures are no gross errors."""
+    """No SD below a fiftieth of the largest: smaller errors are no gross ones."""
     return jnp.maximum(sigma, jnp.maximum(RELATIVE_FLOOR * jnp.max(sigma), 1e-6))

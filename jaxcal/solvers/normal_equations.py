@@ -346,13 +346,13 @@ def complete_curvature(flat: Vector, gradient: Vector, unknowns: int) -> Vector:
     """
     twist = unrolled.cross([-value for value in gradient[:3]])
     skew = unrolled.cross([0.5 * value for value in gradient[3:6]])
-    flat, indices = list(flat), pairs(unknowns)
+    flat, indices = list(flat), square_indices(unknowns)
     for i in range(3):
         for j in range(3):
-            index = indices.index((i, 3 + j))
+            index = indices[i, 3 + j]
             flat[index] = unrolled.add(flat[index], twist[i][j])
             if j > i:
-                index = indices.index((3 + i, 3 + j))
+                index = indices[3 + i, 3 + j]
                 flat[index] = unrolled.add(flat[index], unrolled.times(-1, skew[i][j]))
     return flat
 
