@@ -35,7 +35,7 @@ CHILD = """
 import json, os, resource, sys, time
 import numpy as np
 from jaxcal.runtime import executables
-from jaxcal.runtime import precision
+from jaxcal.runtime import jax_modes
 traced = []
 def function(x, more, plan):
     traced.append(1)
@@ -48,7 +48,7 @@ if "wait" in sys.argv:
         time.sleep(0.005)
 import jax
 settings = dict(jax.config.values), dict(os.environ)
-with precision.own_modes():
+with jax_modes.own_modes():
     found = executables.run(
         function, (np.arange(3.0), (np.ones(3),)), (2.0, "a"), flags={}, label={"program": "child"}
     )

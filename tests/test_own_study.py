@@ -18,7 +18,7 @@ from jaxcal import CalibrationError, FormatError, InputError
 from jaxcal.runtime import jax_cache
 from jaxcal.runtime.isolated import python_command
 from jaxcal.study import open_results, run_study
-from jaxcal.study.own import Study, study_from, where_defined
+from jaxcal.study.interface import Study, study_from, where_defined
 from jaxcal.study.run import Silence
 from jaxcal.study.store import Store
 

@@ -78,7 +78,7 @@ def pool() -> list[ProcessPoolExecutor]:
 
 
 WHERE = (("module", "jaxcal.study.spec"), ("name", "Spec"))
-"""Of the class that the study's text is of (jaxcal.study.own)."""
+"""Of the class that the study's text is of (jaxcal.study.interface)."""
 
 
 def study_share(canonical: str, chunks: list[int]) -> tuple[int, float]:
@@ -135,7 +135,7 @@ def stage_times(canonical: str, repeats: int) -> dict[str, float]:
     import jax.numpy as jnp
 
     import jaxcal
-    from jaxcal.study import lean, pipeline
+    from jaxcal.study import pipeline, trials
     from jaxcal.study.simulation import draw, draw_noise
 
     spec = Spec.from_canonical(canonical)
@@ -155,7 +155,7 @@ def stage_times(canonical: str, repeats: int) -> dict[str, float]:
         return drawn
 
     def solve(batch):
-        problems = lean.problems_of(batch.images)
+        problems = trials.problems_of(batch.images)
         options = jaxcal.Options(differentiate=False)
         found = jaxcal.calibrate_batch(problems, prior="gaussian", options=options)
         # What is not read of the answer is not computed.

@@ -20,7 +20,7 @@ from hw.robot.identity import LOCAL
 from hw.robot.motion_plan import MotionPlan
 from hw.runtime.errors import refused
 from hw.setup.description import Setup, controller_arm
-from jaxcal.io.readable import naming
+from jaxcal.io.given_files import naming
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from hw.recording.check import settings_of
 from hw.runtime.choices import OPERATORS, PHANTOMS, PLACEMENTS, PLACEMENTS_OF, PLANS
 from hw.setup.description import Setup
 from jaxcal import InputError
-from jaxcal.io.readable import naming
+from jaxcal.io.given_files import naming
 from jaxcal.runtime.given_values import LARGEST_SEED, whole_number
 
 MOST_IMAGES = 1000

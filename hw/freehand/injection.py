@@ -44,7 +44,7 @@ from hw.ultrasound.receiver import UltrasoundStream
 from jaxcal import CalibrationError, InputError
 from jaxcal.data.poses import inverse_poses
 from jaxcal.data.recording import MINIMUM_IMAGES, MetresError, check_pose_units
-from jaxcal.io.readable import naming
+from jaxcal.io.given_files import naming
 from jaxcal.runtime.array_types import Float
 
 _KIND = "pattern-injection"

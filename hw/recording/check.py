@@ -24,7 +24,7 @@ from hw.recording.layout import (
 )
 from jaxcal import FormatError, InputError
 from jaxcal.data.poses import check_poses
-from jaxcal.io.readable import check_readable, naming
+from jaxcal.io.given_files import check_readable, naming
 from jaxcal.io.untrusted import (
     Node,
     UpTo,

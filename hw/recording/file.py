@@ -41,7 +41,7 @@ from hw.recording.layout import (
 )
 from jaxcal import FormatError, OutputError, __version__
 from jaxcal.io.atomic import write_text
-from jaxcal.io.readable import one_line
+from jaxcal.io.given_files import one_line
 
 RESERVE_BYTES = 2**27
 """The writer ends in order when the disk has less free than this: 128 MiB, many seconds of data."""

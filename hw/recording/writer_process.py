@@ -21,7 +21,7 @@ from hw.recording.file import RecordingWriter
 from hw.recording.layout import RecordingHeader
 from hw.runtime.pipes import read_message
 from jaxcal import CalibrationError
-from jaxcal.io.readable import one_line
+from jaxcal.io.given_files import one_line
 
 FLUSH_S = 1.0
 

@@ -25,8 +25,8 @@ from hw.runtime.hosts import check_host
 from jaxcal import InputError
 from jaxcal.data.poses import check_poses
 from jaxcal.data.probe import LinearProbe
+from jaxcal.io.given_files import naming
 from jaxcal.io.openigtlink import PORT
-from jaxcal.io.readable import naming
 from jaxcal.io.toml import load_toml
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.messages import quoted

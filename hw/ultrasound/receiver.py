@@ -18,9 +18,9 @@ import numpy as np
 from hw.runtime.clock import REAL, Clock, Lag
 from hw.runtime.errors import Device, DeviceError, LostError, StaleError
 from hw.ultrasound.framing import MessageDecoder
+from jaxcal.io.given_files import one_line
 from jaxcal.io.message_content import Picture, Pixels, StatusMessage, Tracked, TrackedFrame
 from jaxcal.io.openigtlink import PORT, RF_DEVICE, Message
-from jaxcal.io.readable import one_line
 from jaxcal.runtime.array_types import Float
 
 DEVICE: Device = "ultrasound"

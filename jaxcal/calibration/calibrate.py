@@ -29,14 +29,14 @@ from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import AnyArray, Array
 from jaxcal.runtime.arrays import array_module, is_traced
 from jaxcal.runtime.given_values import check_flag, whole_number
-from jaxcal.runtime.messages import shown
-from jaxcal.runtime.precision import (
+from jaxcal.runtime.jax_modes import (
     importing_jax,
     in_own_modes,
     inside_transformation,
     require_float64,
     with_dtype,
 )
+from jaxcal.runtime.messages import shown
 from jaxcal.solvers.names import Data, Method, PriorName
 from jaxcal.solvers.plan import (
     LAWS,

@@ -20,7 +20,7 @@ from jaxcal.result.calibration import Calibration
 from jaxcal.runtime import compiler, executables
 from jaxcal.runtime.arrays import assembled, first_images, map_arrays
 from jaxcal.runtime.executables import bucket
-from jaxcal.runtime.precision import in_own_modes, inside_transformation
+from jaxcal.runtime.jax_modes import in_own_modes, inside_transformation
 from jaxcal.solvers.closed_form.single import closed_form_start
 from jaxcal.solvers.plan import Given, SolvePlan
 

@@ -19,7 +19,7 @@ from jaxcal.model.batch import ImagePlanes, barrier
 from jaxcal.model.observations import BoundedOffsets, LocalUnknown, local_unknowns
 from jaxcal.model.unknowns import Blocks
 from jaxcal.result.calibration import Calibration
-from jaxcal.runtime.precision import in_standard_promotion
+from jaxcal.runtime.jax_modes import in_standard_promotion
 from jaxcal.solvers import methods
 from jaxcal.solvers.consensus import find_consensus, rigid_model
 from jaxcal.solvers.methods import Solution

@@ -32,7 +32,7 @@ from jaxcal.result.calibration import Status
 from jaxcal.runtime import compiler, executables
 from jaxcal.runtime.arrays import first_images, is_traced
 from jaxcal.runtime.given_values import check_flag, real_array
-from jaxcal.runtime.precision import in_own_modes, inside_transformation, require_float64
+from jaxcal.runtime.jax_modes import in_own_modes, inside_transformation, require_float64
 from jaxcal.solvers import dense
 from jaxcal.solvers.consensus import (
     FEWEST_IMAGES,

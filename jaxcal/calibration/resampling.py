@@ -41,8 +41,8 @@ from jaxcal.model.thresholds import MAD
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.arrays import each_image, is_traced
 from jaxcal.runtime.given_values import LARGEST_SEED, check_key, check_made, whole_number
+from jaxcal.runtime.jax_modes import in_own_modes
 from jaxcal.runtime.messages import shown
-from jaxcal.runtime.precision import in_own_modes
 from jaxcal.solvers import dense
 from jaxcal.solvers.plan import SolvePlan
 

@@ -219,8 +219,8 @@ def calibrate(
     )
     check_request(request)
     _check_apart(targets, report, out)
+    from jaxcal.io.given_files import naming
     from jaxcal.io.hdf5 import load
-    from jaxcal.io.readable import naming
     from jaxcal.report.accuracy import settle
     from jaxcal.report.next_poses import next_poses_record
     from jaxcal.report.record import calibration_record, check_test_images

@@ -178,7 +178,7 @@ def segmented(recording: Recording) -> tuple[Recording, list[str]]:
             "images do not: segment them first"
         )
     from jaxcal.data.segmentation.segment import segment_recording
-    from jaxcal.io.readable import naming
+    from jaxcal.io.given_files import naming
 
     with naming(recording.source):
         points, found = segment_recording(recording)

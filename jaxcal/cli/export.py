@@ -143,9 +143,9 @@ def check_configuration(
     """
     import numpy as np
 
+    from jaxcal.io.given_files import naming
     from jaxcal.io.outputs import check_output
     from jaxcal.io.plus import patched_configuration
-    from jaxcal.io.readable import naming
     from jaxcal.io.xml import read_xml
 
     def is_one(path: str | os.PathLike[str]) -> bool:

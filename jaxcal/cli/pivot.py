@@ -28,7 +28,7 @@ def pivot(poses: str, no_robust: bool, as_json: bool) -> int:
     """
     import_engine()
     from jaxcal.calibration.pivot import calibrate_pivot
-    from jaxcal.io.readable import naming
+    from jaxcal.io.given_files import naming
     from jaxcal.io.text import read_poses
     from jaxcal.report.pivot import pivot_lines
     from jaxcal.runtime.jax_cache import enable_compilation_cache

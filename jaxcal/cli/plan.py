@@ -241,8 +241,8 @@ def _from_recording(
     from jaxcal import design
     from jaxcal.calibration.calibrate import calibrate, unknown_names
     from jaxcal.data.probe import PRESETS
+    from jaxcal.io.given_files import naming
     from jaxcal.io.hdf5 import load
-    from jaxcal.io.readable import naming
     from jaxcal.report.next_poses import NOT_PLANNED
 
     names = unknown_names(estimate)

@@ -122,9 +122,9 @@ def segment(
     import_engine()
     from jaxcal.data.segmentation.segment import segment_recording
     from jaxcal.io.atomic import check_writable
+    from jaxcal.io.given_files import naming
     from jaxcal.io.hdf5 import load, save
     from jaxcal.io.outputs import RECORDING, check_output, is_recording
-    from jaxcal.io.readable import naming
     from jaxcal.runtime.jax_cache import enable_compilation_cache
 
     target = _default_out(recording) if out is None else out

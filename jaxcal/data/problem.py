@@ -20,8 +20,8 @@ from jaxcal.data.recording import MINIMUM_IMAGES, Images, Kind, Recording, image
 from jaxcal.data.sound import WATER_M_S
 from jaxcal.runtime.array_types import AnyArray, Float, HeldArray
 from jaxcal.runtime.arrays import array_module, array_tree, each_image, is_traced, static
+from jaxcal.runtime.jax_modes import importing_jax, in_own_modes
 from jaxcal.runtime.messages import shown
-from jaxcal.runtime.precision import importing_jax, in_own_modes
 
 if TYPE_CHECKING:
     from jax.typing import DTypeLike

@@ -21,7 +21,7 @@ from jaxcal.design.constraints import Region
 from jaxcal.design.greedy import Chosen, Search, are_alike
 from jaxcal.design.information import Model, covariance_of
 from jaxcal.design.noise import Noise
-from jaxcal.runtime.precision import in_own_modes
+from jaxcal.runtime.jax_modes import in_own_modes
 
 _STEPS = 8
 _HALVINGS = 5

@@ -20,7 +20,7 @@ from jaxcal.design.planning import Plan
 from jaxcal.diagnostics.metrics import reconstruction_precision
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.given_values import LARGEST_SEED, check_made, real_array, whole_number
-from jaxcal.runtime.precision import importing_jax, in_own_modes
+from jaxcal.runtime.jax_modes import importing_jax, in_own_modes
 
 if TYPE_CHECKING:
     from jaxcal.data.problem import Problem

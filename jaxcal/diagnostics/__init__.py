@@ -4,6 +4,7 @@
     uncertainty      offsets' SDs, weakest direction, what is known from the prior alone
     residual_checks  images that stand out, the fit of the noise model, which poses to add
     unmodelled       errors that the model leaves out and that the residuals show
+    outlier_agreement   whether the images left out agree on another calibration
     summary          all of these for a calibration or a batch
     directions, law_words, misfits, outliers   the same in words
     warnings         everything that a person should know before using an answer

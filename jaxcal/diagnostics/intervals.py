@@ -38,7 +38,7 @@ from jaxcal.model.unknowns import count_unknowns, in_image
 from jaxcal.runtime.array_types import AnyArray, Float
 from jaxcal.runtime.arrays import array_module, is_traced
 from jaxcal.runtime.given_values import is_number, real_array
-from jaxcal.runtime.precision import traceable
+from jaxcal.runtime.jax_modes import traceable
 from jaxcal.solvers.plan import TUNED
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from jaxcal import InputError
 from jaxcal.runtime.array_types import AnyArray, Bool, Float
 from jaxcal.runtime.arrays import array_module, is_traced
 from jaxcal.runtime.given_values import real_array
-from jaxcal.runtime.precision import traceable
+from jaxcal.runtime.jax_modes import traceable
 
 
 @traceable

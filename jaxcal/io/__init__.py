@@ -10,7 +10,7 @@ imports             ``sources`` (which kind a file is), ``frame_poses`` (``folde
                     ``poses_by_time``) and ``frame_points`` (what belongs to a frame),
                     ``target_search``, ``importing`` (the recording), ``import_options``
 transforms          ``itk`` (Slicer), ``plus`` (configurations, fCal), ``ros``, ``tus_rec``
-what all need       ``untrusted`` and ``heap`` (HDF5), ``xml``, ``toml``, ``readable``,
+what all need       ``untrusted`` and ``heap`` (HDF5), ``xml``, ``toml``, ``given_files``,
                     ``frame_names``, ``atomic``
 =================== ==========================================================================
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxcal import FormatError, MissingExtraError
-from jaxcal.io.readable import check_readable, naming, one_line
+from jaxcal.io.given_files import check_readable, naming, one_line
 from jaxcal.runtime.messages import quoted
 
 if TYPE_CHECKING:

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from jaxcal import FormatError, InputError
+from jaxcal.io.given_files import one_line
 from jaxcal.io.png import png_size
-from jaxcal.io.readable import one_line
 from jaxcal.io.sequence import FolderPixels, TrackedSequence
 from jaxcal.io.text import PoseTable
 from jaxcal.runtime.array_types import Int

@@ -10,8 +10,8 @@ import numpy as np
 
 from jaxcal import InputError
 from jaxcal.io.folder import rows_by_file
+from jaxcal.io.given_files import naming
 from jaxcal.io.poses_by_time import times_of_table
-from jaxcal.io.readable import naming
 from jaxcal.io.sequence import TrackedSequence
 from jaxcal.io.slicer import pixels_from_markups, read_markups
 from jaxcal.io.text import PoseTable

@@ -43,7 +43,7 @@ from jaxcal.data.recording import (
     make_images,
 )
 from jaxcal.io.atomic import atomic_path
-from jaxcal.io.readable import check_readable, naming, path_name
+from jaxcal.io.given_files import check_readable, naming, path_name
 from jaxcal.io.target_search import FATES, FrameResults
 from jaxcal.io.untrusted import (
     Node,

@@ -16,8 +16,8 @@ import numpy as np
 from jaxcal import FormatError, InputError
 from jaxcal.data.poses import check_affine, rotations_from_quaternions
 from jaxcal.io.atomic import atomic_path, write_text
+from jaxcal.io.given_files import check_readable, naming
 from jaxcal.io.lines import text_lines
-from jaxcal.io.readable import check_readable, naming
 from jaxcal.io.untrusted import Node, UpTo, array, child, group, open_root, string
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.messages import quoted

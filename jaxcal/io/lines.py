@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterator
 
 from jaxcal import FormatError
-from jaxcal.io.readable import read_bytes
+from jaxcal.io.given_files import read_bytes
 
 # Spreadsheets' errors, in English and German, are #N/A, #NV and words like #NAME? and #DIV/0!.
 _COMMENT = re.compile(r"\s*#(?!(?:N/A|NV|[A-Z/0]+[!?])[,;\t])")

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxcal import FormatError
-from jaxcal.io.readable import check_readable
+from jaxcal.io.given_files import check_readable
 from jaxcal.io.sequence import Pixels, TrackedSequence
 from jaxcal.io.sequence_header import (
     SequenceHeader,

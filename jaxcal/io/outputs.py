@@ -11,7 +11,7 @@ import stat
 from collections.abc import Callable, Iterable
 
 from jaxcal import CalibrationError, FormatError, InputError
-from jaxcal.io.readable import path_name
+from jaxcal.io.given_files import path_name
 
 Path = str | os.PathLike[str]
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from jaxcal import FormatError
-from jaxcal.io.readable import one_line
+from jaxcal.io.given_files import one_line
 
 Packing = Literal["raw", "zlib", "gzip"]
 

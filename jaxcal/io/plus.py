@@ -21,7 +21,7 @@ from jaxcal import FormatError
 from jaxcal.data.poses import check_affine
 from jaxcal.io.atomic import atomic_path
 from jaxcal.io.frame_names import FramePair, capitalised, check_frames, path_between, split_name
-from jaxcal.io.readable import naming
+from jaxcal.io.given_files import naming
 from jaxcal.io.xml import Element, parse_xml, read_xml
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.messages import quoted

@@ -19,9 +19,9 @@ from numpy import ndarray
 
 from jaxcal import FormatError, InputError
 from jaxcal.io.frame_names import FramePair
+from jaxcal.io.given_files import one_line
 from jaxcal.io.openigtlink import HEADER_SIZE, PORT, Message, encode_header, parse_header
 from jaxcal.io.plus import update_transform_command
-from jaxcal.io.readable import one_line
 from jaxcal.io.xml import parse_xml
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.messages import quoted

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxcal import FormatError
+from jaxcal.io.given_files import check_readable, one_line
 from jaxcal.io.grey import grey_of
-from jaxcal.io.readable import check_readable, one_line
 
 if TYPE_CHECKING:
     from PIL.Image import Image

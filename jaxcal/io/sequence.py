@@ -18,9 +18,9 @@ from jaxcal import FormatError, InputError
 from jaxcal.data.poses import check_poses, inverse_poses
 from jaxcal.io.columns import LENGTHS_MM, LengthUnit
 from jaxcal.io.frame_names import FramePair, path_between
+from jaxcal.io.given_files import naming
 from jaxcal.io.grey import grey_of
 from jaxcal.io.pixel_stream import Packing, PixelStream
-from jaxcal.io.readable import naming
 from jaxcal.runtime.array_types import Bool, Float, Int
 from jaxcal.runtime.messages import quoted
 

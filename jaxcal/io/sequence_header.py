@@ -21,8 +21,8 @@ import numpy as np
 
 from jaxcal import FormatError, InputError
 from jaxcal.io.frame_names import FramePair, check_frames, split_name
+from jaxcal.io.given_files import one_line
 from jaxcal.io.pixel_stream import Packing, PixelStream
-from jaxcal.io.readable import one_line
 from jaxcal.io.sequence import Orientation, Pixels, TrackedSequence
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.messages import quoted

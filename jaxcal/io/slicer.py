@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from jaxcal import FormatError
+from jaxcal.io.given_files import naming, one_line, read_bytes
 from jaxcal.io.lines import text_lines
-from jaxcal.io.readable import naming, one_line, read_bytes
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.messages import quoted
 

@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.io.readable import naming
+from jaxcal.io.given_files import naming
 from jaxcal.io.sequence import TrackedSequence
 from jaxcal.runtime.array_types import Bool, Float, Int
 

@@ -17,7 +17,7 @@ from jaxcal import FormatError, InputError
 from jaxcal.data.poses import QuaternionOrder, check_poses, rotations_from_quaternions
 from jaxcal.data.recording import Recording, make_images
 from jaxcal.io.columns import LENGTHS_MM, Columns, LengthUnit, columns_of_header
-from jaxcal.io.readable import naming
+from jaxcal.io.given_files import naming
 from jaxcal.io.table import Table, has_commented_header, parse_numbers, read_table
 from jaxcal.runtime.array_types import Float, Int
 from jaxcal.runtime.messages import quoted

@@ -13,7 +13,7 @@ import tomllib
 from typing import Any
 
 from jaxcal import FormatError
-from jaxcal.io.readable import naming, one_line, read_bytes
+from jaxcal.io.given_files import naming, one_line, read_bytes
 
 MAXIMUM_BYTES = 2**20
 """Largest file that is read."""

@@ -21,8 +21,8 @@ from jaxcal import FormatError
 from jaxcal.data.poses import rotations_from_quaternions
 from jaxcal.io.columns import LENGTHS_MM, LengthUnit
 from jaxcal.io.frame_names import FramePair
+from jaxcal.io.given_files import naming
 from jaxcal.io.lines import text_lines
-from jaxcal.io.readable import naming
 from jaxcal.io.sequence import TrackedSequence
 from jaxcal.io.table import parse_number
 from jaxcal.runtime.messages import quoted

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from jaxcal import FormatError, InputError
+from jaxcal.io.given_files import check_readable, naming
 from jaxcal.io.lines import text_lines
-from jaxcal.io.readable import check_readable, naming
 from jaxcal.io.sequence import Hdf5Pixels, TrackedSequence
 from jaxcal.io.sequence_header import LARGEST_FRAME, MOST_FRAMES
 from jaxcal.io.untrusted import UpTo, array, check_rows, child, open_root

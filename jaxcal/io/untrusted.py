@@ -21,8 +21,8 @@ import numpy as np
 from h5py import h5a, h5d, h5g, h5l, h5o, h5s, h5t, h5z  # pyright: ignore[reportAttributeAccessIssue]
 
 from jaxcal import CalibrationError, FormatError
+from jaxcal.io.given_files import one_line
 from jaxcal.io.heap import CheckedFile
-from jaxcal.io.readable import one_line
 from jaxcal.runtime.messages import quoted
 
 MAXIMUM_BYTES = 2**28
@@ -62,7 +62,7 @@ def open_root(
     """Open a file for reading and give its root group.
 
     Args:
-        source: a path (checked by :func:`jaxcal.io.readable.check_readable`) or a binary file
+        source: a path (checked by :func:`jaxcal.io.given_files.check_readable`) or a binary file
             object.
         length: bytes that the file is to have, with zeros beyond its end; None: its own length.
 

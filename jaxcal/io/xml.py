@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from xml.parsers import expat
 
 from jaxcal import FormatError
-from jaxcal.io.readable import naming, one_line, read_bytes
+from jaxcal.io.given_files import naming, one_line, read_bytes
 from jaxcal.runtime.messages import quoted
 
 MAXIMUM_BYTES = 8 * 2**20

@@ -33,7 +33,7 @@ from jaxtyping import Array, Float
 from jaxcal.model import unrolled
 from jaxcal.model.distributions import Family
 from jaxcal.model.unrolled import Entry
-from jaxcal.runtime.precision import in_standard_promotion
+from jaxcal.runtime.jax_modes import in_standard_promotion
 
 NODES = 8
 """Nodes in each half of the interval."""

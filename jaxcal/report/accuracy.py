@@ -39,7 +39,7 @@ from jaxcal.diagnostics.intervals import (
     tre_at,
     tre_over,
 )
-from jaxcal.diagnostics.left_out import left_out
+from jaxcal.diagnostics.outlier_agreement import agreeing_outliers
 from jaxcal.diagnostics.unmodelled import unmodelled
 from jaxcal.model.image_points import distance, mean_of_squares
 from jaxcal.report.contradictions import contradictions
@@ -95,7 +95,7 @@ def accuracy_record(
     tre["residuals_over_stated"] = math.sqrt(ratio) if ratio > 0 else None
     tre["chance"] = chance
     tre["unmodelled"] = _unmodelled(answer, grid)
-    agreeing = left_out(answer, float(tre["stated_mm"]), grid)
+    agreeing = agreeing_outliers(answer, float(tre["stated_mm"]), grid)
     tre["left_out"] = agreeing and dict(zip(("images", "apart_mm"), agreeing, strict=True))
     return {
         "tre": tre,

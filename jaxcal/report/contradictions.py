@@ -11,7 +11,7 @@ The covariance assumes that the noise model holds. It is contradicted if
 - the errors within the image drift, come in two groups, or would be explained by an error that the
   model leaves out (:mod:`jaxcal.diagnostics.unmodelled`);
 - images that were left out as outliers agree among themselves on another calibration
-  (:mod:`jaxcal.diagnostics.left_out`).
+  (:mod:`jaxcal.diagnostics.outlier_agreement`).
 """
 
 from __future__ import annotations

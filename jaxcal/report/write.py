@@ -17,7 +17,7 @@ import numpy as np
 from jaxcal import CalibrationError, FormatError, InputError, OutputError
 from jaxcal.data.recording import Recording
 from jaxcal.io.atomic import STAGED, replace_files, write_text
-from jaxcal.io.readable import one_line, path_name
+from jaxcal.io.given_files import one_line, path_name
 from jaxcal.report.convergence import Curve
 from jaxcal.report.verdict import verdict
 from jaxcal.result.calibration import Calibration

@@ -13,8 +13,8 @@ import numpy as np
 from jaxcal import FormatError, InputError
 from jaxcal.io.atomic import atomic_path, write_text
 from jaxcal.io.frame_names import FramePair, two_names
+from jaxcal.io.given_files import check_readable, naming, one_line, path_name, read_bytes
 from jaxcal.io.outputs import check_output
-from jaxcal.io.readable import check_readable, naming, one_line, path_name, read_bytes
 from jaxcal.model.unknowns import TABLE, tangent_names
 from jaxcal.result.transform import ImageTransform, SaveFormat, transform_from_plus_matrix
 from jaxcal.runtime.messages import quoted

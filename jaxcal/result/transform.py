@@ -26,7 +26,7 @@ from jaxcal import InputError
 from jaxcal.data.poses import check_affine, check_poses
 from jaxcal.data.recording import check_spacing_unit
 from jaxcal.io.frame_names import FramePair
-from jaxcal.io.readable import naming
+from jaxcal.io.given_files import naming
 from jaxcal.model.image_points import point_jacobian
 from jaxcal.model.unknowns import TABLE, tangent_names
 from jaxcal.runtime.array_types import Float

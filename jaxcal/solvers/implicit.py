@@ -23,7 +23,7 @@ from jaxtyping import Array, Float
 from jaxcal import InputError
 from jaxcal.model.batch import ImagePlanes, Iterate
 from jaxcal.model.observations import MediumPrior, Observation
-from jaxcal.runtime.precision import in_standard_promotion
+from jaxcal.runtime.jax_modes import in_standard_promotion
 from jaxcal.solvers import dense, reml
 from jaxcal.solvers.normal_equations import accumulate
 

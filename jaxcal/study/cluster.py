@@ -28,9 +28,9 @@ from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any, cast
 
 from jaxcal import CalibrationError, InputError, MissingExtraError, __version__
-from jaxcal.io.readable import one_line
+from jaxcal.io.given_files import one_line
 from jaxcal.runtime.messages import quoted
-from jaxcal.study.own import (
+from jaxcal.study.interface import (
     Chunk,
     Results,
     Study,

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Key
 from jaxcal import InputError
 from jaxcal.data.geometry import matrix_from_rotation, rotation_from_vector
 from jaxcal.data.problem import Problem
-from jaxcal.runtime.precision import in_own_modes
+from jaxcal.runtime.jax_modes import in_own_modes
 
 OutlierKind = Literal["echo", "click", "pose", "slip", "mixed"]
 OUTLIER_KINDS: tuple[OutlierKind, ...] = get_args(OutlierKind)

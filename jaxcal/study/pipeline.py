@@ -6,7 +6,7 @@ options. Elevation, noise, bounds and all other numbers are arguments, so that a
 through the same programs. They take blocks of a fixed number of trials, whatever the size of the
 chunks. A short last block is filled up, and the results of the added trials are dropped.
 
-All methods are computed by :mod:`jaxcal.study.lean`.
+All methods are computed by :mod:`jaxcal.study.trials`.
 
 The programs are compiled for one thread each: trials are independent, so that processes, one for
 each group of cores (:mod:`jaxcal.study.cluster`), use several cores better than XLA's thread pool
@@ -31,15 +31,15 @@ from jaxcal.data.probe import LinearProbe
 from jaxcal.model.batch import Iterate
 from jaxcal.model.unknowns import RIGID
 from jaxcal.runtime.compiler import fast_to_run, single_threaded
-from jaxcal.runtime.precision import in_own_modes
+from jaxcal.runtime.jax_modes import in_own_modes
 from jaxcal.solvers.plan import Options
 from jaxcal.solvers.start import ConventionalStart, conventional
+from jaxcal.study.interface import Chunk
 from jaxcal.study.laws import OffsetLaw
-from jaxcal.study.lean import Experiments, Kind, experiments, solve
 from jaxcal.study.offsets import nominal_bound
-from jaxcal.study.own import Chunk
 from jaxcal.study.simulation import Protocol
 from jaxcal.study.spec import Condition, MethodSpec, Spec
+from jaxcal.study.trials import Experiments, Kind, experiments, solve
 
 BATCH_SIZE = {"cpu": 64}
 """Trials drawn or solved side by side on a device; on a CPU what they need stays in its caches."""
@@ -89,9 +89,9 @@ def compute_chunk(spec: Spec, chunk: Chunk) -> dict[str, np.ndarray]:
         chunk: one of its chunks.
 
     Returns:
-        Arrays by name: those of :class:`Measured` (methods, trials, ...) and ``realised`` (trials,
-        3), the root mean square errors of lateral position, range and elevational offset that were
-        drawn, mm. They depend neither on what was computed before nor on the worker.
+        Arrays by name: those of :class:`TrialResults` (methods, trials, ...) and ``realised``
+        (trials, 3), the root mean square errors of lateral position, range and elevational offset
+        that were drawn, mm. They depend neither on what was computed before nor on the worker.
     """
     condition, devices = spec.condition(chunk.condition), tuple(jax.local_devices())
     pieces, size = _block(spec, devices)
@@ -146,11 +146,11 @@ class Block:
         return self._begun[max_steps]
 
     def measured(self, method: MethodSpec) -> dict[str, np.ndarray]:
-        """What one method makes of it: the arrays of :class:`Measured`."""
+        """What one method makes of it: the arrays of :class:`TrialResults`."""
         given = method.bound_given is not None
         bound = np.asarray(bound_mm(method, self._condition)) if given else None
         kind: Kind = (method.method, method.prior)
-        program = lean_program(kind, method.options, self._devices)
+        program = solve_program(kind, method.options, self._devices)
         begun = self.begun(method.max_iterations)
         measured = program(self.batch, self.truth, begun, bound)
         return {name: _trials(value) for name, value in vars(measured).items()}
@@ -229,7 +229,7 @@ def compile_pieces(function: Any, devices: Devices, *, pieces: int) -> Any:
 
 @cache
 def draw_program(shape: ProblemShape, devices: Devices) -> Any:
-    """From (trial indices, seed, numbers) to :func:`jaxcal.study.lean.experiments`, compiled."""
+    """From (trial indices, seed, numbers) to :func:`jaxcal.study.trials.experiments`, compiled."""
 
     def program(indices: Array, seed: Array, numbers: dict[str, Any]) -> Any:
         given = shape.protocol(jax.tree.map(jnp.asarray, numbers))
@@ -255,8 +255,8 @@ def begin_program(max_steps: int, devices: Devices) -> Any:
 
 
 @cache
-def lean_program(kind: Kind, options: Options, devices: Devices) -> Any:
-    """From experiments, truth, conventional fits and bound to :func:`jaxcal.study.lean.solve`."""
+def solve_program(kind: Kind, options: Options, devices: Devices) -> Any:
+    """From experiments, truth, conventional fits and bound to :func:`jaxcal.study.trials.solve`."""
 
     def program(
         batch: Experiments, truth: Iterate, begun: ConventionalStart, bound: Array | None

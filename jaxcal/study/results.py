@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxcal import FormatError, MissingExtraError
 from jaxcal.result.calibration import Status
-from jaxcal.study.own import Chunk
+from jaxcal.study.interface import Chunk
 from jaxcal.study.pipeline import COMPONENTS, bound_mm
 from jaxcal.study.spec import UNITS, Spec
 from jaxcal.study.store import Store

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 from jaxcal import FormatError, InputError, OutputError
 from jaxcal.io.atomic import lock
-from jaxcal.io.readable import one_line
+from jaxcal.io.given_files import one_line
 from jaxcal.runtime.given_values import check_flag, whole_number
 from jaxcal.runtime.interrupts import no_interrupt_lost
 from jaxcal.runtime.messages import shown
 from jaxcal.study.cluster import compute_on_cluster, connected
-from jaxcal.study.own import Chunk, Results, Study, computed
+from jaxcal.study.interface import Chunk, Results, Study, computed
 from jaxcal.study.store import Store
 
 if TYPE_CHECKING:

@@ -42,8 +42,8 @@ from jaxcal.runtime.given_values import (
     is_number,
     whole_number,
 )
+from jaxcal.runtime.jax_modes import in_own_modes, require_float64
 from jaxcal.runtime.messages import shown
-from jaxcal.runtime.precision import in_own_modes, require_float64
 from jaxcal.study import draws
 from jaxcal.study.laws import OffsetLaw, check_law
 from jaxcal.study.offsets import standard_offsets

@@ -62,14 +62,14 @@ import numpy as np
 from jaxcal import InputError
 from jaxcal.calibration.calibrate import ALTERNATION, Request, check_alternation, check_request
 from jaxcal.data.probe import LinearProbe
-from jaxcal.io.readable import naming
+from jaxcal.io.given_files import naming
 from jaxcal.io.toml import load_toml, parse_toml
 from jaxcal.runtime.given_values import whole_number
 from jaxcal.runtime.messages import quoted, shown
 from jaxcal.solvers.names import Method, PriorName
 from jaxcal.solvers.plan import DEFAULT_MAX_ELEVATION_MM, Options, Prior
+from jaxcal.study.interface import ArraySpec, Chunk
 from jaxcal.study.laws import OffsetLaw, check_law
-from jaxcal.study.own import ArraySpec, Chunk
 
 MAXIMUM_BYTES = 2**20
 """Largest spec that is read."""

@@ -29,9 +29,9 @@ import numpy as np
 
 from jaxcal import FormatError, InputError, OutputError
 from jaxcal.io.atomic import atomic_path, write_text
-from jaxcal.io.readable import check_readable, one_line, path_name
+from jaxcal.io.given_files import check_readable, one_line, path_name
 from jaxcal.io.untrusted import array, child, number, open_root, text
-from jaxcal.study.own import Chunk, Study
+from jaxcal.study.interface import Chunk, Study
 from jaxcal.study.spec import MAXIMUM_BYTES, Spec
 
 FORMAT = "jaxcal-study-chunk"
@@ -123,7 +123,7 @@ class Store(Generic[S]):
 
         Args:
             chunk: which.
-            results: of :func:`jaxcal.study.own.computed`.
+            results: of :func:`jaxcal.study.interface.computed`.
             maker: what computed it, as :func:`jaxcal.study.pipeline.made_by` says it.
 
         Raises:

@@ -22,10 +22,10 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from jaxcal import CalibrationError
-from jaxcal.io.readable import one_line
+from jaxcal.io.given_files import one_line
 from jaxcal.runtime import jax_cache
 from jaxcal.runtime.isolated import python_command
-from jaxcal.study.own import Chunk, Results, Study, computed, study_from, where_defined
+from jaxcal.study.interface import Chunk, Results, Study, computed, study_from, where_defined
 
 MOST_DEATHS = 3
 """Workers that may die over one chunk before the study gives up."""

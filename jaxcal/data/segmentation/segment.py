@@ -35,8 +35,8 @@ from jaxcal.runtime import executables
 from jaxcal.runtime.array_types import AnyArray
 from jaxcal.runtime.compiler import ONE_PROBLEM, batch_flags, fast_to_run
 from jaxcal.runtime.given_values import check_flag, is_number, whole_number
+from jaxcal.runtime.jax_modes import in_own_modes
 from jaxcal.runtime.messages import shown
-from jaxcal.runtime.precision import in_own_modes
 
 Method = Literal["least-squares", "shortest"]
 Scale = Literal["frame", "pooled"]

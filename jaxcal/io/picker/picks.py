@@ -24,7 +24,7 @@ import numpy as np
 
 from jaxcal import FormatError, InputError, OutputError
 from jaxcal.io.atomic import write_text
-from jaxcal.io.readable import read_bytes
+from jaxcal.io.given_files import read_bytes
 from jaxcal.io.text import read_pose_table
 from jaxcal.runtime.messages import quoted
 

@@ -36,7 +36,7 @@ from jaxcal.data.recording import MINIMUM_IMAGES
 from jaxcal.model import unrolled
 from jaxcal.model.unrolled import Matrix, Vector
 from jaxcal.runtime.arrays import is_traced
-from jaxcal.runtime.precision import in_standard_promotion, own_modes, require_float64, with_dtype
+from jaxcal.runtime.jax_modes import in_standard_promotion, own_modes, require_float64, with_dtype
 from jaxcal.solvers.closed_form.reduced_objective import (
     CONSTRAINTS,
     NEARBY,

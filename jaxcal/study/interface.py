@@ -1,4 +1,4 @@
-"""Studies of one's own: what the engine needs of a study, and how workers find its class.
+"""The interface between a study and the engine, and how workers find the class of a study.
 
 :class:`jaxcal.study.spec.Spec` is the study that a TOML file describes. Any other class with the
 same few members runs through the same engine: in chunks that are resumed, in this process, on

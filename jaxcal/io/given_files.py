@@ -1,4 +1,4 @@
-"""Checks of a file before it is opened; its name and the words of errors, for messages."""
+"""Files that a caller named: checks before they are opened, and their names in messages."""
 
 from __future__ import annotations
 

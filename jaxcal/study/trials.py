@@ -1,4 +1,4 @@
-"""The methods of a study, computed only as far as a study stores their results.
+"""The trials of a study: simulated and solved in batches, as far as their results are stored.
 
 A study keeps X's errors, SDs, status and iterations of millions of solves. Here experiments stay in
 the form of :mod:`jaxcal.model.batch`, planes of numbers with the images as the last axis. The
@@ -35,7 +35,7 @@ SEGMENTED = 16
 """Trials whose distances are fitted side by side."""
 
 
-class Measured(eqx.Module):
+class TrialResults(eqx.Module):
     """What one method makes of a batch of experiments.
 
     Attributes:
@@ -141,7 +141,7 @@ def solve(
     kind: Kind,
     options: Options,
     bound: Array | None,
-) -> Measured:
+) -> TrialResults:
     """One method on a batch.
 
     Args:
@@ -169,7 +169,7 @@ def solve(
     )
     pairs = ((iterate.translation, truth.translation), (iterate.point, truth.point))
     away = [jnp.sqrt(jnp.sum((one - true) ** 2, axis=0)) for one, true in pairs]
-    return Measured(
+    return TrialResults(
         rp=_precision(iterate, truth, batch.test),
         rotation_error=chord_angle(iterate.rotation - truth.rotation),
         translation_error=away[0],

@@ -22,13 +22,21 @@ from jaxcal.solvers.closed_form.single import ClosedForm, solve_problem
 if TYPE_CHECKING:
     from jaxcal.result.calibration import Calibration
 
-FEWEST, LEAST_SHARE, AGREEING_TIMES, APART_TIMES = 8, 0.2, 2.0, 3.0
-"""So many images that were left out, and at least this share of those in use, agree among
-themselves if their errors within the image are at most so many times as large as those of the
-others, and the two fits are farther apart than so many times what is stated of both."""
+FEWEST_LEFT_OUT = 8
+"""With fewer images left out there is no second group."""
+
+LEAST_SHARE = 0.2
+"""Nor is there if they are less than this share of the images in use."""
+
+LARGEST_SD_RATIO = 2.0
+"""The images left out agree if the SD of their errors within the image, under a fit of their own,
+is at most so many times that of the images in use."""
+
+LEAST_APART = 3.0
+"""The two fits differ if they are farther apart than so many times the error stated of both."""
 
 
-def left_out(
+def agreeing_outliers(
     answer: Calibration, stated: float, grid: Float[np.ndarray, "m 2"]
 ) -> tuple[int, float] | None:
     """Number of images left out that agree among themselves, and how far apart the fits are, mm.
@@ -46,7 +54,7 @@ def left_out(
         return None
     # Frames of a pose that is held are masked in the answer's problem already.
     left = (np.asarray(problem.mask) > 0) & ~kept
-    if left.sum() < max(FEWEST, LEAST_SHARE * kept.sum()):
+    if left.sum() < max(FEWEST_LEFT_OUT, LEAST_SHARE * kept.sum()):
         return None
     estimate = ("scale",) if "scale" in answer.blocks else ()
     try:
@@ -56,10 +64,10 @@ def left_out(
         )
     except InputError:
         return None
-    if not _within(other, problem, left) <= AGREEING_TIMES * _within(own, problem, kept):
+    if not _within(other, problem, left) <= LARGEST_SD_RATIO * _within(own, problem, kept):
         return None
     apart = _apart(own, other, problem, grid)
-    if apart <= APART_TIMES * stated * math.sqrt(1 + kept.sum() / left.sum()):
+    if apart <= LEAST_APART * stated * math.sqrt(1 + kept.sum() / left.sum()):
         return None
     return int(left.sum()), apart
 
