@@ -17,7 +17,7 @@ from scipy.stats import norm
 import jaxcal
 from jaxcal.calibration.resampling import (
     _compared,
-    _of_image,
+    _from_full_image,
     bootstrap,
     cross_validate,
     relative_twist,
@@ -159,7 +159,7 @@ def test_a_pixel_has_other_places_in_the_images_of_other_calibrations(data):
     places = np.stack([lateral, 0 * lateral, axial, 1 + 0 * axial])
     for fit in (other, slower):
         fits = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], replace(fit, problem=None))
-        found = _of_image(fits, whole, whole.problem)
+        found = _from_full_image(fits, whole, whole.problem)
         expected = fit.apply(ends).points
         np.testing.assert_allclose((found[0] @ places).T[:, :3], expected, atol=1e-9)
     first, second = (np.asarray(fit.image_to_probe) for fit in (whole, other))

@@ -22,8 +22,8 @@ out.
 *Streams.* Images of a moving probe may differ in pose and still share slowly changing errors. The
 residuals of the conventional fit (closed form, :mod:`jaxcal.solvers.closed_form.single`) have an
 integrated autocorrelation time t, and n images are worth n / t independent ones. Where t reaches
-``STREAM`` images and chance does not explain it, every t-th image is kept. For weaker correlation
-see :mod:`jaxcal.calibration.serial_correlation`.
+``LEAST_STREAM_TIME`` images and chance does not explain it, every t-th image is kept. For weaker
+correlation see :mod:`jaxcal.calibration.serial_correlation`.
 
 References: Wiles, Thompson and Frantz 2004 (accuracy of optical trackers); Sokal 1997,
 section 3 (integrated autocorrelation time); Liang and Zeger 1986 (clustered data).
@@ -58,35 +58,38 @@ LEVER_MM = 100.0
 HOLD_MM = 3.0
 """Images linked by pairs of the same pose are one hold if they all lie within this."""
 
-ROBUST_FROM = 5
+MEDIAN_FROM = 5
 """From so many frames on, the point of a group is the median of its frames' points."""
 
-MOVED = 0.25
+MOVED_SHARE = 0.25
 """Frames of one pose contradict it if their points differ by more than this share of the spread of
 all points, and by more than ``LEAST_MOVED``."""
 LEAST_MOVED = 3.0
 """px for pixels, mm for points: what noise of the points can do where they hardly differ."""
 
-STREAM = 4.0
+LEAST_STREAM_TIME = 4.0
 """Least autocorrelation time of a stream, in images."""
-SURE = 5.0
+STREAM_SCORE = 5.0
 """In a stream the correlation of successive errors is more than so many SDs above zero."""
 
-FEWEST_OF_STREAM = 40
-"""Shorter recordings are not examined for slowly changing errors."""
+SHORTEST_STREAM = 40
+"""Recordings with fewer images are not examined for slowly changing errors."""
 
-CONTINUOUS = 0.25
+CONTINUOUS_SHARE = 0.25
 """In a stream the probe moves between successive images by less than this share of the distance of
 poses half a recording apart."""
 
-ABSORBED = 6.0
+NEGLIGIBLE_SHARE = 0.01
+"""Kinds of error below this share of the variance (a tenth in size) do not make a stream."""
+
+ABSORBED_ERRORS = 6.0
 """Independent elevational errors that the fit absorbs: the number of unknowns that move them."""
-LEAST_SHARE = 0.4
+LEAST_SHARE_LEFT = 0.4
 """At least this share of the errors is assumed to be left after the fit."""
 
 
 @dataclass(frozen=True)
-class Independent:
+class IndependentImages:
     """Which images can be treated as independent.
 
     Attributes:
@@ -136,7 +139,7 @@ class Independent:
         return told
 
 
-def independent(data: Any, estimate: tuple[str, ...] = ()) -> tuple[Any, Independent]:
+def independent(data: Any, estimate: tuple[str, ...] = ()) -> tuple[Any, IndependentImages]:
     """Let every pose count once.
 
     Args:
@@ -156,7 +159,7 @@ def independent(data: Any, estimate: tuple[str, ...] = ()) -> tuple[Any, Indepen
     frozen = _frozen(poses, np.asarray(data.measurements, dtype=float), mask)
     mask = mask & ~frozen
     group = same_pose(poses, mask)
-    found = replace(_represented(group, mask), frozen=tuple(np.flatnonzero(frozen).tolist()))
+    found = replace(_representatives(group, mask), frozen=tuple(np.flatnonzero(frozen).tolist()))
     if found.poses < MINIMUM_IMAGES:
         left_out = f" ({found.words[0]})" if found.frozen else ""
         raise InputError(
@@ -165,10 +168,10 @@ def independent(data: Any, estimate: tuple[str, ...] = ()) -> tuple[Any, Indepen
             f"than {SAME_POSE_MM:g} mm count once)"
         )
     if found.frozen:
-        data = _changed(data, {"mask": mask})
+        data = _with_arrays(data, {"mask": mask})
     if found.poses < found.frames:
-        data = _joined(data, found)
-    if found.images >= FEWEST_OF_STREAM:
+        data = _with_group_averages(data, found)
+    if found.images >= SHORTEST_STREAM:
         stride = _stride(data, estimate)
         if stride > 1:
             left = np.flatnonzero(found.keep)
@@ -176,7 +179,7 @@ def independent(data: Any, estimate: tuple[str, ...] = ()) -> tuple[Any, Indepen
             # Keep the middle of every piece.
             keep[left[stride // 2 :: stride]] = True
             found = replace(found, keep=keep, stride=stride)
-            data = _changed(data, {"mask": keep})
+            data = _with_arrays(data, {"mask": keep})
     return data, found
 
 
@@ -196,11 +199,11 @@ def same_pose(
         [poses[used, :3, 3:], poses[used, :3, :3] * LEVER_MM + poses[used, :3, 3:]], axis=2
     )
     places = corners.transpose(0, 2, 1).reshape(len(used), 12)
-    first, second = _near(places, 2 * SAME_POSE_MM)
+    first, second = _near_pairs(places, 2 * SAME_POSE_MM)
     near = displacement(poses[used[first]], poses[used[second]]) <= SAME_POSE_MM
     linked = _components(len(used), first[near], second[near])
     label = np.arange(len(used))
-    for members in _split(linked):
+    for members in _members(linked):
         label[members] = members[0] + _pieces(poses[used[members]])
     _, order, inverse = np.unique(label, return_index=True, return_inverse=True)
     group[used] = np.argsort(np.argsort(order))[inverse]
@@ -217,7 +220,7 @@ def displacement(
     return shift + LEVER_MM * turn
 
 
-def _near(
+def _near_pairs(
     places: Float[np.ndarray, "n 12"], limit: float
 ) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
     """Pairs whose coordinates all differ by less than the limit."""
@@ -251,12 +254,12 @@ def _frozen(
     used, frozen = np.flatnonzero(mask), np.zeros(len(mask), bool)
     if not len(used):
         return frozen
-    limit = max(MOVED * np.sqrt(points[used].var(axis=0).sum()), LEAST_MOVED)
+    limit = max(MOVED_SHARE * np.sqrt(points[used].var(axis=0).sum()), LEAST_MOVED)
     each = np.unique(poses[used].reshape(len(used), 16), axis=0, return_inverse=True)[1]
-    for rows in map(used.__getitem__, _split(each.ravel())):
+    for rows in map(used.__getitem__, _members(each.ravel())):
         away = np.linalg.norm(points[rows] - np.median(points[rows], axis=0), axis=1)
         # One wrong click does no harm where the hold's point is a median.
-        frozen[rows] = (np.median(away) if len(rows) >= ROBUST_FROM else away.max()) > limit
+        frozen[rows] = (np.median(away) if len(rows) >= MEDIAN_FROM else away.max()) > limit
     return frozen
 
 
@@ -276,7 +279,7 @@ def _components(
         label = after
 
 
-def _split(label: Int[np.ndarray, " n"]) -> list[Int[np.ndarray, " m"]]:
+def _members(label: Int[np.ndarray, " n"]) -> list[Int[np.ndarray, " m"]]:
     """The members of every component that has several."""
     order = np.argsort(label, kind="stable")
     parts = np.split(order, np.flatnonzero(np.diff(label[order])) + 1)
@@ -299,7 +302,9 @@ def _pieces(poses: Float[np.ndarray, "m 4 4"]) -> Int[np.ndarray, " m"]:
     return piece
 
 
-def _represented(group: Int[np.ndarray, " n"], mask: Bool[np.ndarray, " n"]) -> Independent:
+def _representatives(
+    group: Int[np.ndarray, " n"], mask: Bool[np.ndarray, " n"]
+) -> IndependentImages:
     """The middle frame of every group stands for it."""
     keep = np.zeros(len(group), bool)
     used = np.flatnonzero(mask)
@@ -307,14 +312,14 @@ def _represented(group: Int[np.ndarray, " n"], mask: Bool[np.ndarray, " n"]) -> 
     parts = np.split(order, np.flatnonzero(np.diff(group[order])) + 1) if len(order) else []
     for part in parts:
         keep[part[len(part) // 2]] = True
-    return Independent(group, keep, frames=len(used), poses=len(parts))
+    return IndependentImages(group, keep, frames=len(used), poses=len(parts))
 
 
 _AVERAGED = ("measurements", "covariance", "max_elevation", "amplitude", "time", "time_of_flight")
 """Arrays of images or problems that are averaged over a group."""
 
 
-def _joined(data: Any, found: Independent) -> Any:
+def _with_group_averages(data: Any, found: IndependentImages) -> Any:
     """The data with one image for every group, at the index of the image that is kept."""
     values: dict[str, Any] = {"poses": np.array(data.poses)}
     names = {field.name for field in fields(data)}
@@ -335,7 +340,7 @@ def _joined(data: Any, found: Independent) -> Any:
         values["poses"][kept] = pose
         for name in _AVERAGED:
             if name in values:
-                values[name][kept] = _middle(before[name][rows], name)
+                values[name][kept] = _group_average(before[name][rows], name)
         if channels is not None:
             weight = before["heard"][rows]
             total = weight.sum(axis=0)
@@ -344,11 +349,11 @@ def _joined(data: Any, found: Independent) -> Any:
             values["heard"][kept] = total >= 0.5 * len(rows)
     if channels is not None:
         heard = {name: values.pop(name) for name in ("distances", "heard")}
-        values["channels"] = _changed(channels, heard)
-    return _changed(data, {"mask": found.keep, **values})
+        values["channels"] = _with_arrays(channels, heard)
+    return _with_arrays(data, {"mask": found.keep, **values})
 
 
-def _changed(data: Any, values: dict[str, Any]) -> Any:
+def _with_arrays(data: Any, values: dict[str, Any]) -> Any:
     """The data with other arrays; each is a numpy or JAX array like the one that it replaces."""
     return replace(
         data,
@@ -359,19 +364,15 @@ def _changed(data: Any, values: dict[str, Any]) -> Any:
     )
 
 
-def _middle(values: np.ndarray, name: str) -> Any:
+def _group_average(values: np.ndarray, name: str) -> Any:
     """The value for a group, from its frames' values of the array with this name."""
     if name == "time_of_flight":
         heard = np.isfinite(values).mean(axis=0) >= 0.5
         total = np.nansum(values, axis=0) / np.maximum(np.isfinite(values).sum(axis=0), 1)
         return np.where(heard, total, np.nan)
-    if name == "measurements" and len(values) >= ROBUST_FROM:
+    if name == "measurements" and len(values) >= MEDIAN_FROM:
         return np.median(values, axis=0)
     return values.mean(axis=0)
-
-
-NEGLIGIBLE = 0.01
-"""Kinds of error below this share of the variance (a tenth in size) do not make a stream."""
 
 
 def _stride(data: Images | Problem, estimate: tuple[str, ...]) -> int:
@@ -386,19 +387,19 @@ def _stride(data: Images | Problem, estimate: tuple[str, ...]) -> int:
     cut = clipped(errors)
     for values in cut.T:
         # Errors much smaller than the others do not count, however slowly they change.
-        if np.var(values) < NEGLIGIBLE * np.sum(np.var(cut, axis=0)):
+        if np.var(values) < NEGLIGIBLE_SHARE * np.sum(np.var(cut, axis=0)):
             continue
         correlation = autocorrelation(values)
-        if correlation[1] * np.sqrt(len(values)) > SURE:
+        if correlation[1] * np.sqrt(len(values)) > STREAM_SCORE:
             time = max(time, correlation_time(correlation))
-    return int(time) if time >= STREAM else 1
+    return int(time) if time >= LEAST_STREAM_TIME else 1
 
 
 def _moves_continuously(poses: Float[np.ndarray, "n 4 4"]) -> bool:
     """Whether successive poses are much closer to each other than any two poses are."""
     steps = displacement(poses[1:], poses[:-1])
     apart = displacement(poses, np.roll(poses, len(poses) // 2, axis=0))
-    return bool(np.median(steps) < CONTINUOUS * np.median(apart))
+    return bool(np.median(steps) < CONTINUOUS_SHARE * np.median(apart))
 
 
 def clipped(errors: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
@@ -423,7 +424,8 @@ def correlation_time(correlation: Float[np.ndarray, " n"]) -> float:
     It is twice the lag at which the correlation is 1 / e. That lag is computed from the lag where
     the correlation has fallen to half, since sums over all lags scatter more. The fall to half is
     counted from lag 1, not from lag 0, so that independent noise has no effect. The result is then
-    enlarged, since the fit absorbs the slowest changes: ``ABSORBED`` of the independent errors.
+    enlarged, since the fit absorbs the slowest changes: ``ABSORBED_ERRORS`` of the independent
+    errors.
     """
     below = np.flatnonzero(correlation[1:] < 0.5 * correlation[1])
     if not len(below):
@@ -431,7 +433,7 @@ def correlation_time(correlation: Float[np.ndarray, " n"]) -> float:
     high, low = correlation[below[0]], correlation[below[0] + 1]
     half = below[0] - 1 + (high - 0.5 * correlation[1]) / (high - low)
     time = max(2 * half / np.log(2), 1.0)
-    return float(time / max(1 - ABSORBED * time / len(correlation), LEAST_SHARE))
+    return float(time / max(1 - ABSORBED_ERRORS * time / len(correlation), LEAST_SHARE_LEFT))
 
 
 def conventional_errors(
@@ -455,6 +457,7 @@ def conventional_errors(
 
 
 def _errors(found: ClosedForm, data: Any) -> Float[np.ndarray, "m 3"]:
+    """Lateral, range and elevational errors of the used images under a conventional fit, mm."""
     used = np.asarray(data.mask) > 0
     poses = np.asarray(data.poses, dtype=float)[used]
     points = np.asarray(data.measurements, dtype=float)[used]

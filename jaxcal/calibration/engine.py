@@ -185,7 +185,7 @@ def _solve_chunks_kept(
         (plan, chunk),
         flags=compiler.batch_flags(),
         label=label,
-        hold=partial(_kept_as_jax_holds, problem=problems) if done else executables.in_numpy,
+        convert=partial(_kept_as_jax_holds, problem=problems) if done else executables.in_numpy,
     )
     return (result, True) if done else (first_images(result, images), False)
 

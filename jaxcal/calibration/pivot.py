@@ -46,6 +46,7 @@ BLOCKS = ("translation", "point")
 AXES = ("x", "y", "z")
 """Axes of the tool's frame, along which the components of an error are."""
 _SUBSET = 4
+"""Poses in a proposal's subset."""
 _LARGEST_RMS_MM = 5.0
 """A tip that stays in a dimple does not move by so much."""
 _LARGEST_SD_MM = 1.0

@@ -47,6 +47,7 @@ from jaxcal.solvers import dense
 from jaxcal.solvers.plan import SolvePlan
 
 LARGEST_RESAMPLES = 100_000
+"""Most resamples of a bootstrap."""
 
 
 class CrossValidation(eqx.Module):
@@ -138,12 +139,12 @@ def cross_validate(
     problem, plan = _one_problem(problem, arguments, "jaxcal.cross_validate")
     count = problem.images
     folds = count if folds is None else whole_number("folds", folds, 2, count)
-    result = _of_all_images(problem, result, plan, arguments)
+    result = _full_calibration(problem, result, plan, arguments)
     problem = replace(problem, mask=jnp.asarray(result.mask, problem.mask.dtype))
     fold = np.arange(count) % folds
     rest = jnp.asarray(fold[None, :] != np.arange(folds)[:, None], problem.mask.dtype)
-    _check_left(problem.mask, rest)
-    fits = calibrate_batch(_many(problem, problem.mask * rest), **_of_each(arguments))
+    _check_remaining(problem.mask, rest)
+    fits = calibrate_batch(_with_masks(problem, problem.mask * rest), **_for_resamples(arguments))
     return _compared(problem, result, fits, fold)
 
 
@@ -156,7 +157,7 @@ def _compared(
     As one program: compiled operation by operation it takes several times as long.
     """
     held = jax.tree.map(lambda leaf: leaf[fold], fits)
-    errors, cloud = _seen(held, problem)
+    errors, cloud = _held_out_errors(held, problem)
     mask = problem.mask
     used = jnp.sum(mask)
     mean = jnp.sum(mask[:, None] * cloud, axis=0) / used
@@ -164,9 +165,9 @@ def _compared(
         jnp.asarray(result.image_to_probe), held.image_to_probe
     )
     moved = mask[:, None] * moved
-    points = _corners(problem, result)
+    points = _box_points(problem, result)
     whole = jnp.asarray(result.image_to_probe)
-    image_moved = _apart(_of_image(held, result, problem), whole, points) * mask
+    image_moved = _rms_distance(_from_full_image(held, result, problem), whole, points) * mask
     sd = jnp.asarray(error_sd(held))
     density = -0.5 * jnp.sum((errors / sd) ** 2 + jnp.log(2 * jnp.pi * sd**2), 1)
     return CrossValidation(
@@ -176,7 +177,7 @@ def _compared(
         rms=jnp.sqrt(jnp.sum(cloud**2) / used),
         log_density=mask * density,
         moved=moved,
-        influence=_in_sds(moved, jnp.asarray(result.covariance)),
+        influence=_length_in_sds(moved, jnp.asarray(result.covariance)),
         image_to_probe=jnp.asarray(fits.image_to_probe),
         converged=jnp.asarray(fits.converged, mask.dtype),
         fold_cost=held.cost,
@@ -216,12 +217,12 @@ def bootstrap(
         root = key
     else:
         root = jax.random.key(whole_number("key", key, 0, LARGEST_SEED))
-    result = _of_all_images(problem, result, plan, arguments)
+    result = _full_calibration(problem, result, plan, arguments)
     mask = jnp.asarray(result.mask, problem.mask.dtype)
     problem = replace(problem, mask=mask)
     rows = _rows(root, mask, resamples)
     # Each draw has as many images as were used, since the mask leaves out the other rows.
-    fits = calibrate_batch(_drawn(problem, rows, mask), **_of_each(arguments))
+    fits = calibrate_batch(_with_rows(problem, rows, mask), **_for_resamples(arguments))
     return _scatter(problem, result, fits)
 
 
@@ -247,9 +248,9 @@ def _scatter(problem: Problem, result: Calibration, fits: Calibration) -> Bootst
     drawn = jnp.asarray(fits.image_to_probe)
     moved = jax.vmap(relative_twist, (None, 0))(whole, drawn)
     moved = jnp.where(converged[:, None] > 0, jnp.abs(moved), jnp.nan)
-    points = _corners(problem, result)
+    points = _box_points(problem, result)
     # A resample that did not converge gets the X of all images, and adds nothing to the scatter.
-    found = _of_image(fits, result, problem)
+    found = _from_full_image(fits, result, problem)
     transforms = jnp.where(converged[:, None, None] > 0, found, whole)
     share = jnp.maximum(jnp.mean(converged), 1e-9)
     return Bootstrap(
@@ -279,8 +280,10 @@ def relative_twist(first: Float[Array, "4 4"], second: Float[Array, "4 4"]) -> F
     return jnp.concatenate([shift, turn])
 
 
-def _of_image(fits: Calibration, result: Calibration, problem: Problem) -> Float[Array, "k 4 4"]:
-    """Transforms from the image of the full calibration, in its mm, to the probe.
+def _from_full_image(
+    fits: Calibration, result: Calibration, problem: Problem
+) -> Float[Array, "k 4 4"]:
+    """Transforms from the image of the full calibration, in that calibration's mm, to the probe.
 
     Another calibration has pixels of another size, another sound speed and another delay, and puts
     the same pixel at another place z' = a (z - o) + o' of its image, with o the range of row 0.
@@ -297,7 +300,7 @@ def _of_image(fits: Calibration, result: Calibration, problem: Problem) -> Float
     return (x.at[:, :3, :3].multiply(stretch[:, None])).at[:, :3, 3].add(shift)
 
 
-def _apart(
+def _rms_distance(
     transforms: Float[Array, "k 4 4"], whole: Float[Array, "4 4"], points: Float[Array, "m 2"]
 ) -> Float[Array, " k"]:
     """Root mean square distance of image points under each transform from those under ``whole``."""
@@ -307,12 +310,12 @@ def _apart(
     return jnp.sqrt(jnp.mean(jnp.sum(moved**2, axis=1), axis=1))
 
 
-def _of_all_images(
+def _full_calibration(
     problem: Problem, result: Calibration | None, plan: SolvePlan, arguments: dict[str, Any]
 ) -> Calibration:
     """The calibration of all images: the caller's, checked, or a new one."""
     if result is None:
-        return calibrate(problem, **_of_one(arguments))
+        return calibrate(problem, **_without_bounds(arguments))
     check_made("result", result, Calibration, "jaxcal.calibrate")
     if np.shape(result.mask) != (problem.images,):
         raise InputError(
@@ -334,14 +337,14 @@ def _of_all_images(
     return result
 
 
-def _of_one(arguments: dict[str, Any]) -> dict[str, Any]:
+def _without_bounds(arguments: dict[str, Any]) -> dict[str, Any]:
     """The arguments without the bound on the offsets, which is the problem's now."""
     return {name: value for name, value in arguments.items() if name != "max_elevation"}
 
 
-def _of_each(arguments: dict[str, Any]) -> dict[str, Any]:
+def _for_resamples(arguments: dict[str, Any]) -> dict[str, Any]:
     """The same for parts of the problem: outliers were found with all images."""
-    return {**_of_one(arguments), "robust": False}
+    return {**_without_bounds(arguments), "robust": False}
 
 
 def _one_problem(
@@ -365,7 +368,8 @@ def _one_problem(
     return jax.tree.map(jnp.asarray, alone), plan
 
 
-def _check_left(mask: Array, rest: Array) -> None:
+def _check_remaining(mask: Array, rest: Array) -> None:
+    """Refuse folds without which too few images remain; ``rest`` is 1 outside of each fold."""
     if is_traced(mask):
         return
     least = int(np.min(np.sum(np.asarray(mask) * np.asarray(rest) > 0, axis=1)))
@@ -375,14 +379,14 @@ def _check_left(mask: Array, rest: Array) -> None:
         )
 
 
-def _many(problem: Problem, masks: Float[Array, "k n"]) -> Problem:
+def _with_masks(problem: Problem, masks: Float[Array, "k n"]) -> Problem:
     """The same problem under many masks."""
     count = masks.shape[0]
     many = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), problem)
     return replace(many, mask=masks)
 
 
-def _drawn(problem: Problem, rows: Array, mask: Float[Array, " n"]) -> Problem:
+def _with_rows(problem: Problem, rows: Array, mask: Float[Array, " n"]) -> Problem:
     """The problem with other rows of images in each of k copies."""
 
     def drawn(rows: Int[Array, " n"]) -> Problem:
@@ -393,6 +397,7 @@ def _drawn(problem: Problem, rows: Array, mask: Float[Array, " n"]) -> Problem:
 
 
 def _parameters(result: Calibration, problem: Problem) -> Parameters:
+    """The unknowns of a calibration of a problem, as the model has them."""
     matrix = jnp.asarray(result.image_to_probe)
     scale = None
     if result.scale_mm_per_px is not None:
@@ -407,8 +412,8 @@ def _parameters(result: Calibration, problem: Problem) -> Parameters:
     return found
 
 
-def _seen(held: Calibration, problem: Problem) -> tuple[Array, Array]:
-    """Errors and reconstructed target of image i through calibration i."""
+def _held_out_errors(held: Calibration, problem: Problem) -> tuple[Array, Array]:
+    """Errors and reconstructed target of image i through calibration i: (n, 3), (n, 3), mm."""
 
     def one(result: Calibration, image: Array) -> tuple[Array, Array]:
         parameters = _parameters(result, problem)
@@ -423,7 +428,10 @@ def _seen(held: Calibration, problem: Problem) -> tuple[Array, Array]:
     return errors, problem.mask[:, None] * cloud
 
 
-def _in_sds(moved: Float[Array, "n 6"], covariance: Float[Array, "6 6"]) -> Float[Array, " n"]:
+def _length_in_sds(
+    moved: Float[Array, "n 6"], covariance: Float[Array, "6 6"]
+) -> Float[Array, " n"]:
+    """sqrt(m' C^-1 m / 6) of every move m of X with the covariance C."""
     scale = jnp.sqrt(jnp.diagonal(covariance))
     # In SDs of the unknowns the matrix is a correlation matrix, well scaled for elimination.
     unit = moved / scale
@@ -431,7 +439,8 @@ def _in_sds(moved: Float[Array, "n 6"], covariance: Float[Array, "6 6"]) -> Floa
     return jnp.sqrt(jnp.sum(unit.T * solved, axis=0) / 6)
 
 
-def _corners(problem: Problem, result: Calibration) -> Float[Array, "5 2"]:
+def _box_points(problem: Problem, result: Calibration) -> Float[Array, "5 2"]:
+    """Corners and middle of the box that the used points fill, [lateral, axial], mm."""
     parameters = _parameters(jax.tree.map(jnp.asarray, result), problem)
     points = measured_points(parameters, problem)
     seen = problem.mask[:, None] > 0

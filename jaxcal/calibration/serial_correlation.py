@@ -40,7 +40,8 @@ CHANCE = 2.1
 FEWEST_SUCCESSIVE = 20
 """With fewer used images the correlation is not estimated."""
 
-LARGEST = 0.98
+LARGEST_CORRELATION = 0.98
+"""Largest correlation of successive errors that is assumed."""
 
 
 def widened(result: Calibration) -> Calibration:
@@ -60,24 +61,26 @@ def widened(result: Calibration) -> Calibration:
     used = int(np.sum(np.asarray(result.mask) > 0))
     if not np.isfinite(covariance).all() or used < FEWEST_SUCCESSIVE:
         return result
-    errors, rows = _in_sds(result)
-    found = _ratio(errors, rows)
+    errors, rows = _whitened(result)
+    found = _covariances(errors, rows)
     if found is None:
         return result
     before, after = found
-    lines = result.linearisation
+    linearisation = result.linearisation
     # The information about all unknowns changes in the same proportion.
-    whole = _stretched(np.linalg.inv(np.asarray(lines.information, float)), before, after)
+    whole = _stretched(np.linalg.inv(np.asarray(linearisation.information, float)), before, after)
     information = np.linalg.inv(whole)
     wider = _stretched(covariance, before, after)
     return replace(
         result,
         unknowns_covariance=like(result.unknowns_covariance, wider),
-        linearisation=replace(lines, information=like(lines.information, information)),
+        linearisation=replace(
+            linearisation, information=like(linearisation.information, information)
+        ),
     )
 
 
-def _in_sds(result: Calibration) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3 p"]]:
+def _whitened(result: Calibration) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3 p"]]:
     """Errors of the used images and their derivatives by the unknowns, in SDs."""
     answer = map_arrays(lambda leaf: np.asarray(leaf)[None], result)
     seen = ImageErrors.of_answer(answer)
@@ -95,7 +98,7 @@ def _in_sds(result: Calibration) -> tuple[Float[np.ndarray, "m 3"], Float[np.nda
     return errors[0, used], rows[0, used]
 
 
-def _ratio(
+def _covariances(
     errors: Float[np.ndarray, "m 3"], rows: Float[np.ndarray, "m 3 p"]
 ) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "p p"]] | None:
     """Covariances of the unknowns without and with the correlation; None where there is none."""
@@ -130,7 +133,7 @@ def believed_correlation(errors: Float[np.ndarray, "m k"]) -> Float[np.ndarray, 
     successive = np.sum(centred[1:] * centred[:-1], axis=0)
     rho = successive / np.where(square > 0, square, 1.0)
     score = np.maximum(rho * np.sqrt(len(errors) - 1), 1e-9)
-    return np.clip(rho * np.maximum(1 - (CHANCE / score) ** 2, 0.0), 0.0, LARGEST)
+    return np.clip(rho * np.maximum(1 - (CHANCE / score) ** 2, 0.0), 0.0, LARGEST_CORRELATION)
 
 
 def _stretched(

@@ -74,7 +74,7 @@ class ImageErrors:
 
     Attributes:
         q: target in the image frame, mm; (0, 0, 1) where left out.
-        turned: M, the derivative of q by the target's position.
+        tracker_to_image: M, the rotation to the image's frame: the derivative of q by the target.
         lateral: measured lateral position, mm.
         distance: measured range, mm.
         errors: lateral, range and elevational, mm; 0 where left out.
@@ -86,7 +86,7 @@ class ImageErrors:
     """
 
     q: Float[Array, "k n 3"]
-    turned: Float[Array, "k n 3 3"]
+    tracker_to_image: Float[Array, "k n 3 3"]
     lateral: Float[Array, "k n"]
     distance: Float[Array, "k n"]
     errors: Float[Array, "k n 3"]
@@ -123,9 +123,9 @@ class ImageErrors:
         poses = np.where(used[..., None, None], problem.poses, np.eye(4))
         measured = np.where(used[..., None], problem.measurements, 1.0)
         away = unknowns.point[:, None] - poses[..., :3, 3]
-        turned = np.swapaxes(poses[..., :3, :3] @ unknowns.rotation[:, None], -1, -2)
+        tracker_to_image = np.swapaxes(poses[..., :3, :3] @ unknowns.rotation[:, None], -1, -2)
         home = np.einsum("kji,kj->ki", unknowns.rotation, unknowns.translation)
-        q = (turned @ away[..., None])[..., 0] - home[:, None]
+        q = (tracker_to_image @ away[..., None])[..., 0] - home[:, None]
         q = np.where(used[..., None], q, [0.0, 0.0, 1.0])
 
         across, deep = np.moveaxis(measured * np.asarray(problem.spacing)[:, None], -1, 0)
@@ -136,7 +136,7 @@ class ImageErrors:
         far = np.hypot(elevation, q[..., 2])
         errors = np.stack([q[..., 0] - lateral, far - distance, elevation], axis=-1)
 
-        along = motion(q, turned, blocks)
+        along = motion(q, tracker_to_image, blocks)
         rows = np.empty_like(along)
         rows[..., 0, :], rows[..., 2, :] = along[..., 0, :], along[..., 1, :]
         rows[..., 1, :] = (elevation / far)[..., None] * along[..., 1, :]
@@ -147,7 +147,9 @@ class ImageErrors:
             rows[..., 0, column], rows[..., 1, column] = -moved[0], -moved[1]
         rows *= mask[..., None, None]
         errors = mask[..., None] * errors
-        return cls(q, turned, lateral, distance, errors, rows, mask, unknowns, problem, blocks)
+        return cls(
+            q, tracker_to_image, lateral, distance, errors, rows, mask, unknowns, problem, blocks
+        )
 
     def shifted(self, answer: Calibration) -> ImageErrors:
         """These errors with the target moved by the estimated error of the tracker, if any."""
@@ -178,7 +180,7 @@ class ImageErrors:
 
     def circle_rows(self, axial: Float[Array, "k n"]) -> Float[Array, "k n 3 p"]:
         """Derivatives of :meth:`from_circle` by the unknowns, the elevation held."""
-        rows = motion(self.q, self.turned, self.blocks) * self.mask[..., None, None]
+        rows = motion(self.q, self.tracker_to_image, self.blocks) * self.mask[..., None, None]
         further = RIGID_UNKNOWNS
         # Further unknowns move the measured point instead of q.
         rows[..., 0, further:] = self.rows[..., 0, further:]
@@ -198,7 +200,9 @@ class ImageErrors:
         further = self.unknowns.along(2)
         # The derivative by the distance is a complex step, too.
         gain = np.imag(model.predicted_distance(far + 1j * TINY, further)) / TINY
-        rows = (gain / far)[..., None] * (apart @ motion(self.q, self.turned, self.blocks))
+        rows = (gain / far)[..., None] * (
+            apart @ motion(self.q, self.tracker_to_image, self.blocks)
+        )
         for column, (change,) in further_derivatives(
             lambda values: [model.predicted_distance(far, values)], further, self.blocks
         ):
@@ -215,17 +219,18 @@ class Whitened:
     Attributes:
         errors: of lateral position, range and offset.
         rows: their derivatives by the shared unknowns.
-        offset: their derivatives by the image's own offset unknown, or None where there is no such
-            unknown (it belongs to a given tracker SD).
-        weight: D of that unknown; 1 if there is none.
-        pull: E / D, by which that unknown follows the shared ones; zeros if there is none.
+        offset_rows: their derivatives by the image's own offset unknown, or None where there is no
+            such unknown (it belongs to a given tracker SD).
+        offset_precision: D of that unknown; 1 if there is none.
+        offset_response: E / D, by which that unknown follows the shared ones; zeros if there is
+            none.
     """
 
     errors: Float[Array, "k n 3"]
     rows: Float[Array, "k n 3 p"]
-    offset: Float[Array, "k n 3"] | None
-    weight: Float[Array, "k n"]
-    pull: Float[Array, "k n p"]
+    offset_rows: Float[Array, "k n 3"] | None
+    offset_precision: Float[Array, "k n"]
+    offset_response: Float[Array, "k n p"]
 
     @classmethod
     def of(cls, answer: Calibration, seen: ImageErrors) -> Whitened:
@@ -242,19 +247,19 @@ class Whitened:
         parts += [] if offset is None else [offset[..., None]]
         parts = [_decorrelated(np.asarray(p / sigma[:, None, :, None]), shape) for p in parts]
         errors, rows = parts[0][..., 0], parts[1]
-        weight, pull = np.ones(seen.mask.shape), np.zeros_like(rows[..., 0, :])
+        weight, response = np.ones(seen.mask.shape), np.zeros_like(rows[..., 0, :])
         if offset is not None:
             offset = parts[2][..., 0]
             weight = np.sum(offset**2, axis=-1) + 1
-            pull = np.einsum("knm,knmp->knp", offset, rows) / weight[..., None]
-        return cls(errors, rows, offset, weight, pull)
+            response = np.einsum("knm,knmp->knp", offset, rows) / weight[..., None]
+        return cls(errors, rows, offset, weight, response)
 
     def leverage(self, inverse: Float[Array, "k p p"]) -> Float[Array, "k n 3"]:
         """The share of each error's variance that the fit absorbs."""
         rows, own = self.rows, 0.0
-        if self.offset is not None:
-            rows = rows - self.offset[..., None] * self.pull[:, :, None]
-            own = self.offset**2 / self.weight[..., None]
+        if self.offset_rows is not None:
+            rows = rows - self.offset_rows[..., None] * self.offset_response[:, :, None]
+            own = self.offset_rows**2 / self.offset_precision[..., None]
         flat = rows.reshape(len(rows), -1, rows.shape[-1])
         return quadratic(flat, inverse).reshape(rows.shape[:-1]) + own
 
@@ -315,7 +320,7 @@ def quadratic(rows: Float[Array, "k m p"], matrix: Float[Array, "k p p"]) -> Flo
 
 
 def motion(
-    q: Float[Array, "k n 3"], turned: Float[Array, "k n 3 3"], blocks: Blocks
+    q: Float[Array, "k n 3"], tracker_to_image: Float[Array, "k n 3 3"], blocks: Blocks
 ) -> Float[Array, "k n 3 p"]:
     """Derivatives of q by the unknowns; blocks begin with X and the target."""
     x, y, z = np.moveaxis(q, -1, 0)
@@ -324,5 +329,5 @@ def motion(
     along[..., 0, 4], along[..., 0, 5] = -z, y
     along[..., 1, 3], along[..., 1, 5] = z, -x
     along[..., 2, 3], along[..., 2, 4] = -y, x
-    along[..., 6:9] = turned
+    along[..., 6:9] = tracker_to_image
     return along

@@ -120,8 +120,8 @@ def influence_of(calibration: Calibration) -> Influence:
         information = np.asarray(alone.linearisation.information)
         information = information / np.asarray(alone.linearisation.variance)[:, None, None]
         averaged = calibration.offset_law is not None and bool(calibration.offset_law.weighed)
-        settled = not averaged and calibration.method != "alternating"
-        return _influence(found, information[0], settled=settled)
+        at_minimum = not averaged and calibration.method != "alternating"
+        return _influence(found, information[0], at_minimum=at_minimum)
 
 
 def _first(leaf: Any) -> Array:
@@ -131,12 +131,12 @@ def _first(leaf: Any) -> Array:
 
 
 def _influence(
-    found: _Errors, information: Float[Array, "p p"], *, settled: bool = True
+    found: _Errors, information: Float[Array, "p p"], *, at_minimum: bool = True
 ) -> Influence:
     rows, errors = found.rows, found.errors
     components = rows.shape[1]
     inverse = inverses(information[None], np.finfo(float).eps)[0]
-    if not settled:
+    if not at_minimum:
         # An answer averaged over laws, or an alternation that stopped early, does not minimise
         # these errors: take them at the minimum.
         gradient = np.einsum("mkp,mk->p", rows, errors)
@@ -186,16 +186,16 @@ def _whitened(answer: Calibration) -> _Errors:
     seen = ImageErrors.of_answer(answer)
     used = np.asarray(answer.mask)[0] > 0
     if answer.data == "channels":
-        return _on_channels(answer, seen, used)
+        return _from_channels(answer, seen, used)
     if answer.prior in TUNED:
-        return _on_points(answer, seen, used)
+        return _from_points(answer, seen, used)
     sd = float(np.sqrt(answer.linearisation.variance[0]))
     y = np.asarray(answer.elevation) if answer.prior == "bounded" else np.zeros_like(seen.mask)
     free = used & (answer.at_bound[0] == 0) if answer.prior == "bounded" else None
     return _equal_weights(seen, y, sd, used, free)
 
 
-def _on_points(answer: Calibration, seen: ImageErrors, used: Array) -> _Errors:
+def _from_points(answer: Calibration, seen: ImageErrors, used: Array) -> _Errors:
     tau = answer.linearisation.tracker_sd
     seen = seen.shifted(answer).centred(answer)
     whitened = Whitened.of(answer, seen)
@@ -203,9 +203,9 @@ def _on_points(answer: Calibration, seen: ImageErrors, used: Array) -> _Errors:
     log_sd, shape = np.zeros(len(rows)), own_covariance(answer, seen)
     if shape is not None:
         log_sd = 0.5 * np.log(np.linalg.det(shape[0][used]))
-    if whitened.offset is not None:
+    if whitened.offset_rows is not None:
         # The image's own unknown has the prior variance 1, so errors have the covariance I + o o'.
-        own = whitened.offset[0][used]
+        own = whitened.offset_rows[0][used]
         size = np.sum(own**2, axis=1, keepdims=True)
         log_sd = log_sd + 0.5 * np.log1p(size[:, 0])
         unit = own / np.sqrt(np.where(size > 0, size, 1.0))
@@ -220,7 +220,7 @@ def _on_points(answer: Calibration, seen: ImageErrors, used: Array) -> _Errors:
     return _Errors(errors, rows, np.arange(3), log_sd, used, len(used))
 
 
-def _on_channels(answer: Calibration, seen: ImageErrors, used: Array) -> _Errors:
+def _from_channels(answer: Calibration, seen: ImageErrors, used: Array) -> _Errors:
     channels, sigma = seen.problem.channels, np.asarray(answer.sigma)[0]
     assert channels is not None
     assert answer.channel_sigma is not None

@@ -57,10 +57,13 @@ are equal."""
 _RADII = 4000
 """Number of values of rho^2 between which its distribution is interpolated."""
 _AT_ONCE = 32
+"""Vectors whose quantiles are computed together."""
 _SPARSE = 16
 """The first rough solution uses one direction in so many."""
 _MOST_STEPS = 60
-_NEARLY = 3e-6
+"""Most steps of Newton's method."""
+_LAST_STEP = 3e-6
+"""A step of ln r^2 shorter than this is the last."""
 
 
 def _check(calibration: object) -> None:
@@ -335,7 +338,7 @@ def _length_quantile(
         along = np.log(np.maximum(shares[rows] @ squares, 1e-300))
         start = np.full(len(along), radial.quantile(chance) - np.log(dimensions))
         near = _solve(along[:, ::_SPARSE], radial, chance, start, 1e-2)
-        found[rows] = _solve(along, radial, chance, near, _NEARLY)
+        found[rows] = _solve(along, radial, chance, near, _LAST_STEP)
     return np.exp(0.5 * found) * np.sqrt(total)
 
 

@@ -64,15 +64,17 @@ def agreeing_outliers(
         )
     except InputError:
         return None
-    if not _within(other, problem, left) <= LARGEST_SD_RATIO * _within(own, problem, kept):
+    if not _sd_in_image(other, problem, left) <= LARGEST_SD_RATIO * _sd_in_image(
+        own, problem, kept
+    ):
         return None
-    apart = _apart(own, other, problem, grid)
+    apart = _rms_distance(own, other, problem, grid)
     if apart <= LEAST_APART * stated * math.sqrt(1 + kept.sum() / left.sum()):
         return None
     return int(left.sum()), apart
 
 
-def _within(found: ClosedForm, problem: Problem, used: np.ndarray) -> float:
+def _sd_in_image(found: ClosedForm, problem: Problem, used: np.ndarray) -> float:
     """SD of the errors within the image of a conventional fit, mm."""
     size = _pixel_size(found, problem)
     measured = np.asarray(problem.measurements, float)[used] * size
@@ -85,11 +87,12 @@ def _within(found: ClosedForm, problem: Problem, used: np.ndarray) -> float:
 
 
 def _pixel_size(found: ClosedForm, problem: Problem) -> Float[np.ndarray, " 2"]:
+    """Lateral and axial size of a pixel, mm; ones for points in mm."""
     spacing = np.asarray(problem.spacing, float)
     return spacing if found.scale_mm_per_px is None else np.asarray(found.scale_mm_per_px)
 
 
-def _apart(
+def _rms_distance(
     first: ClosedForm, second: ClosedForm, problem: Problem, grid: Float[np.ndarray, "m 2"]
 ) -> float:
     """How far apart two fits put the image's pixels on the probe, root mean square, mm."""

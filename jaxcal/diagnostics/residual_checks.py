@@ -42,7 +42,10 @@ FEWEST_TO_CHECK = 20
 """With fewer used images the noise model is not checked."""
 
 TILT_RAD = 0.4363
+"""Tilt of a further image about an image axis: 25 degrees."""
+
 SIDEWAYS_MM = 25.0
+"""Lateral distance of the target from the middle in a further image to the side."""
 
 
 def inspect(
@@ -241,20 +244,20 @@ def gains(answer: Calibration, seen: ImageErrors, uncertainty: Uncertainty) -> F
         axis=1,
     )
     # M of the pose whose rotation is nearest to the mean of those in use.
-    mean = np.einsum("kn,knij->kij", kept, seen.turned)
-    closeness = np.where(kept > 0, np.einsum("knij,kij->kn", seen.turned, mean), -np.inf)
-    usual = seen.turned[np.arange(len(kept)), np.argmax(closeness, axis=1)]
+    mean = np.einsum("kn,knij->kij", kept, seen.tracker_to_image)
+    closeness = np.where(kept > 0, np.einsum("knij,kij->kn", seen.tracker_to_image, mean), -np.inf)
+    usual = seen.tracker_to_image[np.arange(len(kept)), np.argmax(closeness, axis=1)]
 
     half, aside = np.array([1.0, 0.5]), np.array([SIDEWAYS_MM, 0.0])
     elsewhere = [middle * half, middle * (2 - half), middle + aside, middle - aside]
     places = np.stack([*[middle] * 6, *elsewhere], axis=1)
-    turned = np.concatenate(
+    tracker_to_image = np.concatenate(
         [_TILTS @ usual[:, None], np.broadcast_to(usual[:, None], (len(kept), 4, 3, 3))], axis=1
     )
     q = np.stack([places[..., 0], np.zeros_like(places[..., 0]), places[..., 1]], axis=-1)
 
     step = uncertainty.spectra.weakest / uncertainty.scale
-    errors = np.einsum("kmip,kp->kmi", motion(q, turned, blocks), step)
+    errors = np.einsum("kmip,kp->kmi", motion(q, tracker_to_image, blocks), step)
     errors = errors[..., [0, 2, 1]]
     # The positions in mm are linear functions of the measurements, so the measurements at these
     # places follow from the positions of two others.

@@ -74,22 +74,26 @@ def assess(answer: Calibration, seen: ImageErrors, eps: float) -> Uncertainty:
         eps: relative rounding of the arithmetic that solved them.
     """
     blocks, kept = answer.blocks, np.asarray(answer.mask)
-    lines = answer.linearisation
-    information = np.asarray(lines.information)
-    variance = np.asarray(lines.variance)
+    linearisation = answer.linearisation
+    information = np.asarray(linearisation.information)
+    variance = np.asarray(linearisation.variance)
     scale = mm_at_target(seen.lever(kept), blocks)
     both = scale[:, :, None] * scale[:, None]
     whitened = answer.prior in TUNED
     found = Spectra.of(
-        information / both, np.asarray(lines.design) / both, variance, eps, whitened=whitened
+        information / both,
+        np.asarray(linearisation.design) / both,
+        variance,
+        eps,
+        whitened=whitened,
     )
     inverse = inverses(information, eps)
     size = np.where(np.isnan(found.weakest_sd), np.nan, variance)
     at_bound, elevation_sd = _offsets(answer, seen, inverse, size)
-    if lines.average_elevation_sd is not None:
+    if linearisation.average_elevation_sd is not None:
         assert answer.offset_law is not None
         better = np.asarray(answer.offset_law.weighed)[:, None] & np.isfinite(elevation_sd)
-        elevation_sd = np.where(better, lines.average_elevation_sd, elevation_sd)
+        elevation_sd = np.where(better, linearisation.average_elevation_sd, elevation_sd)
     return Uncertainty(
         elevation_sd=elevation_sd,
         at_bound=at_bound,
@@ -242,10 +246,10 @@ def _offsets(
         kept = kept & (at_bound == 0)
     elif answer.linearisation.tracker_sd is not None:
         whitened = Whitened.of(answer, seen)
-        assert whitened.offset is not None
+        assert whitened.offset_rows is not None
         tau = answer.linearisation.tracker_sd[:, None]
-        along = seen.rows[..., 2, :] - tau[..., None] * whitened.pull
-        total = size * (quadratic(along, inverse) + tau**2 / whitened.weight)
+        along = seen.rows[..., 2, :] - tau[..., None] * whitened.offset_response
+        total = size * (quadratic(along, inverse) + tau**2 / whitened.offset_precision)
     else:
         total = size * quadratic(seen.rows[..., 2, :], inverse)
     return at_bound, np.where(kept, np.sqrt(np.where(kept, total, 1.0)), np.nan)

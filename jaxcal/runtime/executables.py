@@ -85,7 +85,7 @@ JAX_SETTINGS = (
 Description = Any
 """The description of a tree, which JSON can hold."""
 
-Hold = Callable[[list[jax.Array]], list[Any]]
+Convert = Callable[[list[jax.Array]], list[Any]]
 """From a program's result, once it is computed, to the arrays that the caller gets."""
 
 _log = logging.getLogger(__name__)
@@ -111,10 +111,12 @@ class _Program:
     result: Description
     from_disk: bool
 
-    def __call__(self, leaves: list[Any], hold: Hold) -> Any:
+    def __call__(self, leaves: list[Any], convert: Convert) -> Any:
         arrays = jax.device_put(leaves, self.device)
         pieces = self.executable.execute_sharded(arrays).disassemble_into_single_device_arrays()
-        return rebuild(self.result, hold(jax.block_until_ready([shards[0] for shards in pieces])))
+        return rebuild(
+            self.result, convert(jax.block_until_ready([shards[0] for shards in pieces]))
+        )
 
 
 def bucket(count: int) -> int:
@@ -143,7 +145,7 @@ def run(
     *,
     flags: compiler.Flags,
     label: dict[str, Any],
-    hold: Hold = in_numpy,
+    convert: Convert = in_numpy,
 ) -> Any:
     """Call ``function(*arguments, plan)``, compiled; by the kept program if there is one.
 
@@ -154,7 +156,7 @@ def run(
         plan: everything static about it.
         flags: of the compiler; those that it does not know are left out.
         label: what the program is, for ``jaxcal cache show``.
-        hold: what to make of the result's arrays; by default numpy's.
+        convert: what to make of the result's arrays; by default numpy's.
 
     Returns:
         The function's result.
@@ -183,7 +185,7 @@ def run(
 
     def compiled() -> _Program:
         return _compile(
-            lambda flat: _found(function)(*rebuild(described, flat), plan),
+            lambda flat: _imported(function)(*rebuild(described, flat), plan),
             leaves,
             device,
             flags,
@@ -195,7 +197,7 @@ def run(
         program = _recall(key) or _load(key, device) or compiled()
         _remember(key, program)
     try:
-        return program(leaves, hold)
+        return program(leaves, convert)
     except jax.errors.JaxRuntimeError as error:
         if not program.from_disk:
             raise
@@ -203,7 +205,7 @@ def run(
     with turn:
         program = compiled()
         _remember(key, program)
-    return program(leaves, hold)
+    return program(leaves, convert)
 
 
 def _name_of(function: str | Callable[..., Any]) -> str:
@@ -212,7 +214,7 @@ def _name_of(function: str | Callable[..., Any]) -> str:
     return f"{function.__module__}:{function.__qualname__}"
 
 
-def _found(function: str | Callable[..., Any]) -> Callable[..., Any]:
+def _imported(function: str | Callable[..., Any]) -> Callable[..., Any]:
     if not isinstance(function, str):
         return function
     module, name = function.split(":")

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from typing import Any
 
 _AGAIN_S = 0.01
+"""Time after which a dropped interrupt is raised again, s."""
 
 
 @contextmanager

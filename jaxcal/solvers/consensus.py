@@ -14,10 +14,10 @@ residuals do not tell good images from bad ones, so the good ones are found by c
    test of *every* image, so that one left out too early returns.
 4. *Evidence.* The finalists' results compete with each other and with the fit to all images. An
    image in use has Gaussian errors with the SDs of the images in use. An image is wrong with
-   probability ``WRONG``; each of its errors is then as predicted or anywhere in a range of
-   ``ANYTHING_MM``. Medians alone would not do: six of a dozen images can be fitted with almost no
-   error in one component, which looks like agreement. If no image is an outlier, none is left out,
-   and the result equals that of ``robust=False``.
+   probability ``WRONG_PROBABILITY``; each of its errors is then as predicted or anywhere in a range
+   of ``WRONG_RANGE_MM``. Medians alone would not do: six of a dozen images can be fitted with
+   almost no error in one component, which looks like agreement. If no image is an outlier, none is
+   left out, and the result equals that of ``robust=False``.
 
 The errors are those of the joint method (lateral position, range, elevational offset), each
 with its own SD. An image stands out where a component, corrected for the image's leverage, is more
@@ -48,12 +48,16 @@ from jaxcal.solvers import dense
 from jaxcal.solvers.proposals import SUBSET, linear_proposals, nominal, subset_weights
 
 SUBSET_STEPS = 2
+"""Gauss-Newton steps on a proposal's own subset."""
 CONCENTRATION = 0.6
+"""Share of the images that a step of concentration uses."""
 CONCENTRATION_STEPS = 5
+"""Steps of concentration, which follow."""
 REJECTION_STEPS = 6
-WRONG = 0.01
+"""Steps of rejection with re-inclusion, which come last."""
+WRONG_PROBABILITY = 0.01
 """Prior probability that an image is wrong."""
-ANYTHING_MM = 60.0
+WRONG_RANGE_MM = 60.0
 """Width of the range in which a wrong image's errors may lie. Larger errors are found as well; with
 a wider range, a third of the images that slipped together would pass for noise."""
 HALVINGS = 24
@@ -101,10 +105,12 @@ class Consensus(eqx.Module):
 def rigid_model(blocks: Blocks) -> ConsensusModel:
     """The calibration's own model: X and the target (and pixel scales where they are free)."""
     kept = tuple(name for name in blocks if name in ("translation", "rotation", "point", "scale"))
-    return ConsensusModel(kept, steadied_errors, partial(linear_proposals, scaled="scale" in kept))
+    return ConsensusModel(
+        kept, depth_scaled_errors, partial(linear_proposals, scaled="scale" in kept)
+    )
 
 
-def steadied_errors(parameters: Parameters, problem: Problem) -> Float[Array, "n 3"]:
+def depth_scaled_errors(parameters: Parameters, problem: Problem) -> Float[Array, "n 3"]:
     """Lateral, range and elevational errors, mm, with the lateral ones of deep images scaled down.
 
     An array's lateral error grows with the range. Beyond the median range it is divided by the
@@ -199,7 +205,8 @@ def _finish(
     # unknowns. For an image left out: each of its errors is as predicted or may be anything.
     cost = jnp.sum(freedom * jnp.log(jnp.sqrt(2 * jnp.pi * jnp.e) * sigma))
     predicted = 0.5 * studentised**2 + jnp.log(jnp.sqrt(2 * jnp.pi * (1 + leverage)) * sigma)
-    wrong = jnp.sum(jnp.minimum(predicted, jnp.log(ANYTHING_MM)), axis=1) - jnp.log(WRONG)
+    wrong = jnp.sum(jnp.minimum(predicted, jnp.log(WRONG_RANGE_MM)), axis=1)
+    wrong = wrong - jnp.log(WRONG_PROBABILITY)
     cost = cost + jnp.sum(jnp.where((used > 0) & (keep == 0), wrong, 0.0))
     sound = (jnp.sum(keep) >= fewest) & jnp.all(jnp.isfinite(studentised))
     cost = jnp.where(sound & jnp.isfinite(cost), cost, jnp.inf)

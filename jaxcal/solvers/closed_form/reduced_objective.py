@@ -128,7 +128,7 @@ class ReducedObjective:
     Attributes:
         factor: (6, 6), C, upper triangular; its rank may be less than 6.
         shift: (6,), g, mm.
-        rest: mm^2.
+        rest: what no x reduces, mm^2.
         resolution: f is known up to this much, mm^2 (rounding).
         images: number of images in use.
         origin_determined: whether the poses determine t and c (not if all rotations share an axis).
@@ -404,7 +404,7 @@ def certify_point(
         of_multipliers = min(of_multipliers, gap_of_multipliers(reduced, x, each))
         if of_multipliers + excess <= enough:
             break
-    unique = of_multipliers + excess <= enough and _alone(reduced, x, candidates[0], excess)
+    unique = of_multipliers + excess <= enough and _is_unique(reduced, x, candidates[0], excess)
     gap = min(gap, of_multipliers)
     if gap + excess > enough:
         gap = min(gap, unconstrained_gap(reduced, x))
@@ -416,7 +416,7 @@ def certify_point(
     )
 
 
-def _alone(
+def _is_unique(
     reduced: ReducedObjective,
     x: Float[np.ndarray, 6],
     values: Float[np.ndarray, " k"],

@@ -30,11 +30,12 @@ import numpy as np
 from jaxcal.runtime.array_types import Float
 from jaxcal.solvers.closed_form.reduced_objective import ReducedObjective
 
-FALL = 0.15
+BARRIER_DECREASE = 0.15
 """Factor on the barrier's weight once the problem with the present weight is solved."""
-CENTRED = 0.3
+CENTRED_BELOW = 0.3
 """Newton decrement below which the weight falls."""
 MOST_STEPS = 300
+"""Most steps of the interior-point method."""
 
 
 @dataclass(frozen=True)
@@ -159,11 +160,11 @@ def lower_bound(
         else:
             break
         best = min(best, -float(multipliers[0]))
-        if decrement < CENTRED:
+        if decrement < CENTRED_BELOW:
             # On the central path the bound is within size * weight of the largest one.
             if best <= enough / unit or weight * size < 0.02 * best or weight < 1e-15:
                 break
-            weight *= FALL
+            weight *= BARRIER_DECREASE
     inverse = np.linalg.inv(lower)
     moments = inverse.T @ inverse
     ideal = moments[where, 0] / moments[0, 0]

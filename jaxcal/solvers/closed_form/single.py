@@ -59,17 +59,30 @@ Numbers = Any
 """A number, or for a batch an array of them."""
 
 DUAL_STEPS = 60
+"""Most steps of Newton's method on the dual."""
+
 DESCENT_STEPS = 400
+"""Most steps of the descents on rotation and free scales."""
+
 ARMIJO = 1e-4
-NEARLY_MET = 1e-6
+"""Least rise of the dual by a step, as a share of what its slope promises."""
+
+CONSTRAINT_TOLERANCE = 1e-6
 """M is regular at the dual's maximum if constraints are off by less than this share of |x|^2."""
-RISE = 1e-13
+
+LEAST_RISE = 1e-13
 """Newton's method on the dual stops when a step raises it by less than this share."""
-SCREENED, KEPT = 12, 20
-"""After the first number of steps, only the second number of descents go on: the lowest ones."""
+
+SCREENING_STEPS = 12
+"""After so many steps only the lowest descents go on."""
+
+KEPT_DESCENTS = 20
+"""How many descents go on."""
+
 LEAST_SCALE = 1e-9
 """Least free scale over the nominal one: at zero, a column of X would have no direction."""
-RESTING = 1e-12
+
+STEP_TOLERANCE = 1e-12
 """A descent is finished when its step is below this, in radians and in shares of the scale."""
 
 
@@ -105,7 +118,7 @@ class Start:
     """The start of methods that begin at the conventional fit: Eq. 7's minimum of one problem.
 
     Attributes:
-        rotation: of X.
+        rotation: of X, from the image's frame to the probe's.
         translation: of X, mm.
         point: the target in the tracker's frame, mm.
         scale: factors on the problem's [lateral, axial] spacing.
@@ -170,7 +183,7 @@ def solve(reduced: ReducedObjective) -> tuple[Float[np.ndarray, 6], Certificate]
         values, x = found
         nearest = feasible(x, constraints)
         off = np.abs((constraints.matrices @ x) @ x - constraints.values).max()
-        if off <= NEARLY_MET * max(1.0, float(x @ x)):
+        if off <= CONSTRAINT_TOLERANCE * max(1.0, float(x @ x)):
             best = descend(reduced, nearest[None])
             certificate = certify_point(reduced, best, values=values)
             if certificate.certified:
@@ -264,7 +277,7 @@ def _dual_maximum(
         if after is None:
             break
         values, state = values + length * step, after
-        if after[0] - value <= RISE * abs(value):
+        if after[0] - value <= LEAST_RISE * abs(value):
             break
     return values * size**2, state[2]
 
@@ -321,6 +334,7 @@ def _rotations() -> Float[np.ndarray, "60 3 3"]:
 
 
 def _parity(permutation: tuple[int, ...]) -> int:
+    """0 for an even permutation, 1 for an odd one."""
     pairs = itertools.combinations(permutation, 2)
     return sum(a > b for a, b in pairs) % 2
 
@@ -367,8 +381,8 @@ def descend(reduced: ReducedObjective, x: Float[np.ndarray, "s 6"]) -> Float[np.
     damping = np.full(len(x), 1e-6)
     eye = np.eye(3)
     for index in range(DESCENT_STEPS):
-        if index == SCREENED and len(x) > KEPT:
-            lowest = np.argsort(value)[:KEPT]
+        if index == SCREENING_STEPS and len(x) > KEPT_DESCENTS:
+            lowest = np.argsort(value)[:KEPT_DESCENTS]
             x, value, damping = x[lowest], value[lowest], damping[lowest]
         pairs = x.reshape(-1, 2, 3)
         weights = ((x @ factor.T + reduced.shift) @ factor).reshape(-1, 2, 3)
@@ -397,7 +411,7 @@ def descend(reduced: ReducedObjective, x: Float[np.ndarray, "s 6"]) -> Float[np.
         # After good steps the damping vanishes, and the steps become pure Newton steps.
         damping = np.where(better, np.where(damping < 1e-9, 0.0, 0.03 * damping), 10 * damping)
         damping = np.where(~better & (damping == 0), 1e-8, np.minimum(damping, 1e8))
-        if np.all((np.abs(step).max(axis=1) < RESTING) | (damping >= 1e8)):
+        if np.all((np.abs(step).max(axis=1) < STEP_TOLERANCE) | (damping >= 1e8)):
             break
     return x[np.argmin(value)]
 
@@ -437,6 +451,7 @@ def _moved(
 def _assemble(
     x: Float[np.ndarray, 6], certificate: Certificate, reduced: ReducedObjective, data: ImageData
 ) -> ClosedForm:
+    """The calibration that a minimiser (a1, a3) stands for."""
     free = reduced.constraints.free
     origin, point = reduced.origin_and_target(x)
     lateral, axial = x[:3], x[3:]
