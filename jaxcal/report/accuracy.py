@@ -24,7 +24,7 @@ from jaxcal.data.problem import Problem
 from jaxcal.data.recording import LARGEST, Recording
 from jaxcal.design.candidates import seen_region
 from jaxcal.design.constraints import Region
-from jaxcal.diagnostics.image_errors import Unknowns, error_sd
+from jaxcal.diagnostics.image_errors import Unknowns, noise_covariance
 from jaxcal.diagnostics.influence import (
     KINDS,
     Influence,
@@ -274,10 +274,10 @@ def _comparison(
         further["scale"] = list(scale[:, None])
     alone = map_arrays(lambda leaf: np.asarray(leaf, float)[None], problem)
     unknowns = Unknowns(x[None, :3, :3], x[None, :3, 3], point[None], further)
-    sigma = np.asarray(error_sd(answer), float)
-    if not np.isfinite(sigma).all():
+    noise = np.asarray(noise_covariance(answer, problem), float)
+    if not np.isfinite(noise[used]).all():
         return None
-    fit = conventional_fit(unknowns, alone, answer.blocks, used, sigma)
+    fit = conventional_fit(unknowns, alone, answer.blocks, used, noise)
     jacobian = image_jacobian(answer, grid)
     error = np.einsum("mia,ab,mib->", jacobian, fit.covariance, jacobian) / len(grid)
     gaussian = np.einsum("mia,ab,mib->", jacobian, found.model_covariance, jacobian) / len(grid)
