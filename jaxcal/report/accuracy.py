@@ -76,11 +76,13 @@ def accuracy_record(
         wanted: further image points for the error, in the images' own unit (px or mm).
 
     Returns:
-        Arrays and plain values; all of them None where X is not observable.
+        Arrays and plain values; all of them None where the calibration must not be used.
     """
     nothing = {"tre": None, "limits": None, "influence": None, "comparison": None}
     answer = result.numpy()
     if not np.isfinite(answer.unknowns_covariance).all() or not bool(result.converged):
+        return nothing
+    if result.wrong_frames is not None:
         return nothing
     problem = answer.problem
     if problem is None:

@@ -42,7 +42,8 @@ CONVENTION = {
     "sound speed over the nominal one",
     "tre": "target registration error: distance between the true and the calibrated place of an "
     "image point; rms_mm over the region and in points with 95 % intervals, stated_* as the "
-    "covariance has them, larger by factor where the data contradict it",
+    "covariance has them, larger by factor where the data contradict it; null where the "
+    "calibration is not to be used",
     "objective": "the minimised sum of squares: mm^2, or in SDs with the gaussian prior; with auto "
     "and uniform that of the Gaussian fit before the laws are weighed",
     "certified": "no transform fits Eq. 7 better (one part in 1e9), which is proved: of the answer "
