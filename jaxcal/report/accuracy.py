@@ -112,11 +112,12 @@ def as_solved(recording: Recording, answer: Calibration) -> Recording:
     images, problem = recording.calibration, answer.problem
     if problem is None:
         return recording
-    mask, measured = np.asarray(problem.mask) > 0, images.measurements
-    if images.kind != "time_of_flight":
-        measured = np.asarray(problem.measurements, float)
-    poses = np.asarray(problem.poses, float)
-    images = replace(images, poses=poses, measurements=measured, mask=mask)
+    images = replace(
+        images,
+        poses=np.asarray(problem.poses, float),
+        measurements=np.asarray(problem.measurements, float),
+        mask=np.asarray(problem.mask) > 0,
+    )
     return replace(recording, calibration=images)
 
 
@@ -261,7 +262,7 @@ def _comparison(
     images, problem = recording.calibration, answer.problem
     if answer.method == "conventional" or further or problem is None:
         return None
-    if images.kind == "time_of_flight" or answer.data == "channels":
+    if answer.data == "channels":
         return None
     used = np.asarray(answer.mask) > 0
     try:

@@ -74,8 +74,14 @@ def calibration_record(
         A dictionary that ``json.dumps(..., allow_nan=False)`` accepts.
 
     Raises:
-        InputError: test images that cannot be brought to mm (see :func:`check_test_images`).
+        InputError: times of flight, or test images that cannot be brought to mm (see
+            :func:`check_test_images`).
     """
+    if recording.calibration.kind == "time_of_flight":
+        raise InputError(
+            f"{recording.source}: the images hold times of flight, not points: give the recording "
+            "that jaxcal.segment_recording makes of them"
+        )
     answer = result.numpy()
     solved, tested = as_solved(recording, answer), check_test_images(recording, test)
     images = solved.calibration if tested is None else tested
