@@ -86,6 +86,9 @@ def draw(images: int, fault: str, indices: Array):
 def judged(result, recording: Recording, x: np.ndarray, size: np.ndarray, fault: str) -> list[bool]:
     """What is told of, and what the verdict is worth, for one calibration."""
     record = calibration_record(result, recording)
+    if record["wrong_frames"]:
+        # It names the scale, and the record states no error.
+        return [True, fault == "scale", False, False, False]
     tre = record["tre"]
     if tre is None or tre.get("rms_mm") is None:
         return [False] * 5

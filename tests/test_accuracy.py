@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import json
 from dataclasses import replace
 
@@ -27,7 +28,7 @@ from jaxcal.diagnostics.intervals import (
     tre_over,
 )
 from jaxcal.model.image_points import point_jacobian
-from jaxcal.report.accuracy import FAIR_MM, GOOD_MM, settle
+from jaxcal.report.accuracy import FAIR_MM, GOOD_MM, region_of, settle
 from jaxcal.report.next_poses import next_poses_sentences
 from jaxcal.report.record import _precision, calibration_record
 from jaxcal.report.tables import calibration_table
@@ -35,6 +36,7 @@ from jaxcal.report.verdict import headline, limits, verdict
 from jaxcal.result.calibration import Medium
 from jaxcal.result.saved import load_calibration
 from jaxcal.result.transform import ImageTransform
+from jaxcal.solvers.closed_form.calibrate import calibrate_closed_form
 
 POINTS = np.array([[5.0, 30.0], [55.0, 80.0], [30.0, 50.0]])
 
@@ -227,6 +229,34 @@ def test_whitened_errors_are_those_of_the_solve(tracker_sd):
     # Of all weights these leave the least error, by the same SDs.
     beside = result.record()["comparison"]
     assert beside["conventional_tre_mm"] > beside["tre_mm"]
+
+
+def test_the_conventional_fits_error_has_the_images_own_covariances_in_it():
+    """Against the closed form of changed data: one error after the other, times its SD."""
+    count = 12
+    recording = experiment(3, images=count, elevation_mm=0.0, noise_mm=0.0)
+    images, x, sigma = recording.calibration, recording.truth.image_to_probe, [0.03, 0.02, 0.01]
+    # Deep images are ten times as noisy as the others.
+    deep = images.measurements[:, 1] > np.median(images.measurements[:, 1])
+    sd = np.where(deep, 10.0, 1.0)[:, None] * sigma[:2]
+    images = replace(images, covariance=sd[..., None] ** 2 * np.eye(2))
+    recording = replace(recording, calibration=images)
+    typical = (*np.sqrt(np.mean(sd**2, axis=0)), sigma[2])
+    result = jaxcal.calibrate(recording, "joint", "gaussian", sigma=typical)
+    grid = region_of(result.numpy(), recording).grid()
+    there = np.concatenate([grid, np.ones((len(grid), 1))], axis=1).T
+    squares, step = 0.0, 1e-3
+    for image, kind in itertools.product(range(count), range(3)):
+        poses, seen = images.poses.copy(), images.measurements.copy()
+        if kind < 2:
+            seen[image, kind] += step
+        else:
+            poses[image, :3, 3] += step * poses[image, :3, :3] @ x[:3, 1]
+        moved = calibrate_closed_form(make_images(poses, seen)).image_to_probe - x
+        size = (*sd[image], sigma[2])[kind] / step
+        squares += size**2 * np.mean(np.sum((moved @ there)[:3] ** 2, axis=0))
+    stated = result.record()["comparison"]["conventional_tre_mm"]
+    assert stated == pytest.approx(np.sqrt(squares), rel=0.01)
 
 
 def test_predicting_an_image_from_the_others_is_what_bayes_says():

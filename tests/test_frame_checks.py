@@ -130,6 +130,9 @@ def test_the_verdict_is_do_not_use_and_the_exit_status_says_so(slips):
         assert lines[0].startswith("Do not use: it looks as if") is named
         assert (exit_code([record]) == ExitCode.NOT_CONVERGED) is named
         assert (result.wrong_frames is not None) is named
+        for part in ("verdict", "tre", "limits", "influence", "comparison"):
+            # The conventional fit is not compared with itself.
+            assert (record[part] is None) is (named or part == "comparison")
         if named:
             assert result.wrong_frames in result.warnings
             assert "invert them" in lines[0]

@@ -185,6 +185,14 @@ def test_test_images_that_cannot_be_used_are_refused(recording):
     assert check_test_images(dataclasses.replace(recording, test=None)) is None
 
 
+def test_times_of_flight_are_no_points(result, recording):
+    times = np.full((20, 2), 4e-5)
+    images = make_images(recording.calibration.poses, times, "time_of_flight")
+    raw = dataclasses.replace(recording, calibration=images)
+    with pytest.raises(jaxcal.InputError, match=r"^[^\n]* hold times of flight[^\n]*$"):
+        calibration_record(result, raw)
+
+
 def test_test_images_that_are_calibrated_with_are_refused(recording):
     images = recording.calibration
     with pytest.raises(InputError, match=r"r\.h5: 19 of 19 test images are among the images to"):

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from conftest import experiment, problem, select
 from oracle.model import Data, Unknowns, errors
-from scipy.stats import norm
+from scipy.stats import multivariate_normal, norm
 
 import jaxcal
 from jaxcal.calibration.resampling import (
@@ -25,6 +25,7 @@ from jaxcal.calibration.resampling import (
 from jaxcal.cli.main import main
 from jaxcal.data.sound import WATER_M_S
 from jaxcal.diagnostics import metrics
+from jaxcal.model.distributions import FAMILIES, OffsetLaw
 from jaxcal.model.image_points import distance
 from jaxcal.result.calibration import Medium
 
@@ -190,6 +191,33 @@ def test_log_density_has_the_trackers_errors_in_it(data, whole):
         there = Unknowns(x[k, :3, :3], x[k, :3, 3], np.asarray(fits.point)[k], np.ones(2))
         expected = norm.logpdf(errors(held, there), scale=np.hypot(sigma, tau)).sum(axis=1)
         np.testing.assert_allclose(found.log_density[fold == k], expected, rtol=1e-9)
+
+
+def test_log_density_is_that_of_the_noise_model(data, whole):
+    """With the images' own covariances and the mean of the offsets, where these were found."""
+    sigma, tau, fold = np.array([0.3, 0.2, 1.0]), 0.5, np.arange(COUNT) % 2
+    mean = np.array([0.4, -0.3])
+    each = np.array([[4.0, 1.0], [1.0, 2.0]]) * np.geomspace(0.1, 10, COUNT)[:, None, None]
+    data = replace(data, covariance=jnp.asarray(each))
+    fits = jax.tree.map(
+        lambda *leaves: jnp.stack(leaves),
+        *(replace(whole, mask=np.asarray(fold != k, float)) for k in range(2)),
+    )
+    one = jnp.ones(2)
+    law = OffsetLaw(
+        jnp.ones((2, len(FAMILIES))), jnp.asarray(mean), one, one, one, 0.9 * one, one > 0
+    )
+    tracked = replace(fits.linearisation, tracker_sd=jnp.full(2, tau))
+    sigmas = jnp.tile(sigma, (2, 1))
+    fits = replace(fits, prior="auto", sigma=sigmas, offset_law=law, linearisation=tracked)
+    found = _compared(data, whole, fits, jnp.asarray(fold))
+    for image, error in enumerate(np.asarray(found.residual)):
+        rest = each[fold != fold[image]].mean(axis=0)
+        size = sigma[:2] / np.sqrt(np.diagonal(rest))
+        seen = each[image] * np.outer(size, size) + tau**2 * np.eye(2)
+        expected = multivariate_normal.logpdf(error[:2], cov=seen)
+        expected += norm.logpdf(error[2], mean[fold[image]], np.hypot(sigma[2], tau))
+        assert float(found.log_density[image]) == pytest.approx(expected, rel=1e-9)
 
 
 @pytest.mark.slow

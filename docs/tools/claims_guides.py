@@ -1,10 +1,10 @@
-"""Claims of the guides: safety, and which poses."""
+"""Claims of the guides: safety, which poses, and when the stated error does not hold."""
 
 from __future__ import annotations
 
-from claims import Row, claim, number, table
+from claims import Row, claim, column, number, percent, table
 
-SAFETY, POSES = "docs/safety.md", "docs/how-to/poses.md"
+SAFETY, POSES, TRUST = "docs/safety.md", "docs/how-to/poses.md", "docs/understand/trust.md"
 
 WAYS = {
     "guard": "guard reports danger",
@@ -42,3 +42,30 @@ claim(
         )
     ],
 )
+
+
+# A mean of the offsets.
+def _off_centre(row: Row) -> list[float]:
+    """Coverage with each mean, %."""
+    where = {name: row[name] for name in ("images", "noise_mm")}
+    return percent(column("off_centre", "cover_t_elevational", **where))
+
+
+claim(
+    TRUST,
+    "in % of {:.0f} simulated recordings, by the mean of the offsets",
+    lambda: set(column("off_centre", "trials")),
+)
+claim(
+    TRUST,
+    "| images | mean {:g} mm | {:g} mm | {:g} mm | {:g} mm | {:g} mm | {:g} mm |",
+    lambda: sorted(set(column("off_centre", "mean_mm"))),
+)
+for centred in table("off_centre"):
+    if number(centred, "mean_mm") == 0:
+        claim(
+            TRUST,
+            f"| {number(centred, 'range_sd_mm'):.2f} mm | {centred['images']} "
+            "| {:.0f} | {:.0f} | {:.0f} | {:.0f} | {:.0f} | {:.0f} |",
+            lambda row=centred: _off_centre(row),
+        )

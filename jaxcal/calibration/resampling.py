@@ -32,9 +32,10 @@ from jaxcal.calibration.calibrate import (
 from jaxcal.calibration.dependence import independent
 from jaxcal.data.problem import Problem, as_problem
 from jaxcal.data.recording import MINIMUM_IMAGES, Recording
-from jaxcal.diagnostics.image_errors import error_sd
+from jaxcal.diagnostics.image_errors import noise_covariance
 from jaxcal.diagnostics.intervals import range_of_row_zero
 from jaxcal.diagnostics.metrics import calibration_reproducibility
+from jaxcal.model.observations import factor_of
 from jaxcal.model.parameters import Parameters
 from jaxcal.model.residuals import measured_points, measurement_residual
 from jaxcal.model.thresholds import MAD
@@ -60,9 +61,10 @@ class CrossValidation(eqx.Module):
             target of the calibration that held the image out, mm.
         precision: norm of the SD of ``cloud`` (Eq. 8 for images that were not used), mm.
         rms: root mean square length of ``cloud``, mm.
-        log_density: (n,) log predictive density of each image's three errors under the Gaussian
-            SDs (the tracker's included) of the calibration that held the image out; 0 where not
-            used.
+        log_density: (n,) log predictive density of each image's three errors under the noise model
+            of the calibration that held the image out: Gaussian, offsets about their mean, with the
+            tracker's errors and, where that calibration weighs by them, the images' own
+            covariances; 0 where not used.
         moved: (n, 6) [v, omega] by which leaving the image (its fold) out moves X, right
             perturbation, mm and rad.
         influence: (n,) length of ``moved`` in SDs of X: sqrt(moved' Cov^-1 moved / 6); NaN without
@@ -168,14 +170,12 @@ def _compared(
     points = _box_points(problem, result)
     whole = jnp.asarray(result.image_to_probe)
     image_moved = _rms_distance(_from_full_image(held, result, problem), whole, points) * mask
-    sd = jnp.asarray(error_sd(held))
-    density = -0.5 * jnp.sum((errors / sd) ** 2 + jnp.log(2 * jnp.pi * sd**2), 1)
     return CrossValidation(
         residual=errors,
         cloud=cloud,
         precision=jnp.sqrt(jnp.sum(mask[:, None] * (cloud - mean) ** 2) / (used - 1)),
         rms=jnp.sqrt(jnp.sum(cloud**2) / used),
-        log_density=mask * density,
+        log_density=mask * _log_density(held, problem, errors),
         moved=moved,
         influence=_length_in_sds(moved, jnp.asarray(result.covariance)),
         image_to_probe=jnp.asarray(fits.image_to_probe),
@@ -426,6 +426,24 @@ def _held_out_errors(held: Calibration, problem: Problem) -> tuple[Array, Array]
 
     errors, cloud = jax.vmap(one)(held, jnp.arange(problem.images))
     return errors, problem.mask[:, None] * cloud
+
+
+def _log_density(
+    held: Calibration, problem: Problem, errors: Float[Array, "n 3"]
+) -> Float[Array, " n"]:
+    """Of the errors of image i under the noise model of calibration i."""
+    noise = jax.vmap(lambda fit, image: noise_covariance(fit, problem)[image])(
+        held, jnp.arange(problem.images)
+    )
+    lateral, distance, offset = errors.T
+    if held.offset_law is not None:
+        offset = offset - held.offset_law.mean
+    planes = jnp.stack([noise[:, 0, 0], noise[:, 1, 0], noise[:, 1, 1]])
+    first, mixed, second = (plane[0] for plane in factor_of(planes[:, None]))
+    third = jnp.sqrt(noise[:, 2, 2])
+    one = lateral / first
+    squares = one**2 + ((distance - mixed * one) / second) ** 2 + (offset / third) ** 2
+    return -0.5 * squares - jnp.log(first * second * third) - 1.5 * jnp.log(2 * jnp.pi)
 
 
 def _length_in_sds(

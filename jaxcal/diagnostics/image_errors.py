@@ -28,6 +28,7 @@ from jaxcal.model.unknowns import (
 )
 from jaxcal.runtime.array_types import AnyArray, Float
 from jaxcal.runtime.arrays import array_module
+from jaxcal.solvers.plan import TUNED
 
 if TYPE_CHECKING:
     from jaxcal.data.problem import Problem
@@ -236,7 +237,7 @@ class Whitened:
     def of(cls, answer: Calibration, seen: ImageErrors) -> Whitened:
         """The errors of calibrations on points with Gaussian errors."""
         sigma, tau = np.asarray(answer.sigma), answer.linearisation.tracker_sd
-        offset, shape = None, own_covariance(answer, seen)
+        offset, shape = None, own_covariance(answer, seen.problem)
         if tau is not None:
             sigma = np.hypot(sigma, tau[:, None] * [1.0, 1.0, 0.0])
             far = np.hypot(seen.errors[..., 2], seen.q[..., 2])
@@ -272,42 +273,61 @@ def error_sd(answer: Calibration) -> Float[AnyArray, "*batch 3"]:
     return array_module(answer.sigma).hypot(answer.sigma, tracker[..., None])
 
 
-def own_covariance(answer: Calibration, seen: ImageErrors) -> Float[Array, "k n 2 2"] | None:
+def noise_covariance(answer: Calibration, problem: Problem) -> Float[AnyArray, "*batch n 3 3"]:
+    """Covariance of every image's lateral, range and elevational errors, mm^2.
+
+    It is that of the noise model that the answer was estimated with, the tracker's errors included.
+    Images that the answer left out have theirs as well.
+    """
+    xp = array_module(answer.sigma, answer.mask, problem.covariance)
+    own = None
+    if answer.prior in TUNED and answer.data == "points":
+        own = own_covariance(answer, problem)
+    shape = xp.broadcast_to(xp.eye(3), (*np.shape(answer.mask), 3, 3))
+    if own is not None:
+        shape = xp.pad(own, [(0, 0)] * (own.ndim - 2) + [(0, 1)] * 2)
+        shape = shape + xp.diag(xp.asarray([0.0, 0.0, 1.0]))
+    sd = error_sd(answer)[..., None, :]
+    return shape * sd[..., :, None] * sd[..., None, :]
+
+
+def own_covariance(answer: Calibration, problem: Problem) -> Float[AnyArray, "*batch n 2 2"] | None:
     """The images' own covariances in units of the common SDs, if these whiten errors; else None.
 
     A tracker's variance is part of both.
     """
-    given = seen.problem.covariance
+    given = problem.covariance
     if given is None:
         return None
-    kept = np.asarray(answer.mask)[..., None] > 0
-    covariance = np.where(kept[..., None], given, np.eye(2))
-    variances = np.where(kept, np.diagonal(covariance, axis1=-2, axis2=-1), 0.0)
-    mean = variances.sum(axis=1) / kept.sum(axis=1)
-    shaped = (mean > 0).all(axis=1)
+    xp = array_module(answer.sigma, answer.mask, given)
+    seen, kept = (xp.asarray(mask)[..., None] > 0 for mask in (problem.mask, answer.mask))
+    covariance = xp.where(seen[..., None], given, xp.eye(2))
+    variances = xp.where(kept, xp.diagonal(covariance, axis1=-2, axis2=-1), 0.0)
+    mean = variances.sum(axis=-2) / kept.sum(axis=-2)
+    shaped = (mean > 0).all(axis=-1)
     if answer.offset_law is not None:
-        shaped = shaped & (np.asarray(answer.offset_law.own_probability) > 0.5)
-    scale = 1 / np.sqrt(np.where(mean > 0, mean, 1.0))
-    shape = covariance * (scale[:, :, None] * scale[:, None])[:, None]
-    shape = np.where(shaped[:, None, None, None], shape, np.eye(2))
+        shaped = shaped & (xp.asarray(answer.offset_law.own_probability) > 0.5)
+    scale = 1 / xp.sqrt(xp.where(mean > 0, mean, 1.0))
+    shape = covariance * (scale[..., :, None] * scale[..., None, :])[..., None, :, :]
+    shape = xp.where(shaped[..., None, None, None], shape, xp.eye(2))
     tau = answer.linearisation.tracker_sd
     if tau is None:
         return shape
     # The tracker adds the same variance to the errors of all images.
-    sigma = np.asarray(answer.sigma)[:, :2]
-    own = sigma / np.hypot(sigma, tau[:, None])
-    shape = shape * (own[:, :, None] * own[:, None])[:, None]
-    return shape + (1 - own**2)[:, None, :, None] * np.eye(2)
+    sigma = xp.asarray(answer.sigma)[..., :2]
+    own = sigma / xp.hypot(sigma, xp.asarray(tau)[..., None])
+    shape = shape * (own[..., :, None] * own[..., None, :])[..., None, :, :]
+    return shape + (1 - own**2)[..., None, :, None] * xp.eye(2)
 
 
 def _decorrelated(
-    values: Float[Array, "k n 3 c"], shape: Float[Array, "k n 2 2"] | None
+    values: Float[Array, "k n 3 c"], shape: Float[AnyArray, "k n 2 2"] | None
 ) -> Float[Array, "k n 3 c"]:
     """Rows multiplied by the inverse Cholesky factor of every image's 2x2 covariance."""
     if shape is None:
         return values
     first = np.sqrt(shape[..., 0, 0])[..., None]
-    mixed = shape[..., 1, 0][..., None] / first
+    mixed = np.asarray(shape[..., 1, 0])[..., None] / first
     second = np.sqrt(shape[..., 1, 1][..., None] - mixed**2)
     lateral = values[..., 0, :] / first
     distance = (values[..., 1, :] - mixed * lateral) / second

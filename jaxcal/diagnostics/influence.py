@@ -200,7 +200,7 @@ def _from_points(answer: Calibration, seen: ImageErrors, used: Array) -> _Errors
     seen = seen.shifted(answer).centred(answer)
     whitened = Whitened.of(answer, seen)
     errors, rows = whitened.errors[0][used], whitened.rows[0][used]
-    log_sd, shape = np.zeros(len(rows)), own_covariance(answer, seen)
+    log_sd, shape = np.zeros(len(rows)), own_covariance(answer, seen.problem)
     if shape is not None:
         log_sd = 0.5 * np.log(np.linalg.det(shape[0][used]))
     if whitened.offset_rows is not None:
@@ -269,7 +269,7 @@ class EqualWeights:
     """The conventional fit of the same images, judged by the noise that was found.
 
     Attributes:
-        covariance: of the fit's unknowns, if errors have the given SDs.
+        covariance: of the fit's unknowns, if errors have the given covariances.
         log_density: of every image's three errors as predicted from the others; 0 where not used.
     """
 
@@ -282,18 +282,18 @@ def conventional_fit(
     problem: Problem,
     blocks: Blocks,
     used: Array,
-    sigma: Float[Array, " 3"],
+    noise: Float[Array, "n 3 3"],
 ) -> EqualWeights:
-    """How good the fit with equal weights is, if errors have other SDs.
+    """How good the fit with equal weights is, if errors have other covariances N_i.
 
-    Its covariance is A^-1 (sum of sigma_k^2 A_k) A^-1 with A the sum of the three kinds' A_k.
+    Its covariance is A^-1 (sum of R_i' N_i R_i) A^-1 with A = sum of R_i' R_i.
 
     Args:
         unknowns: of the conventional fit (one leading axis of length 1).
         problem: the data, with the same leading axis.
         blocks: its unknowns.
         used: images in use.
-        sigma: SDs of lateral position, range and offset, mm.
+        noise: covariance of every image's lateral, range and elevational errors, mm^2.
     """
     seen = ImageErrors.of(unknowns, problem, blocks)
     zero = np.zeros_like(seen.mask)
@@ -303,8 +303,10 @@ def conventional_fit(
     scaled = _equal_weights(seen, zero, sd, used)
     rows = scaled.rows.reshape(-1, scaled.rows.shape[2])
     found = _influence(scaled, rows.T @ rows)
-    weight = (sigma / sd) ** 2
-    return EqualWeights(np.einsum("k,kpq->pq", weight, found.shares), found.log_density)
+    kind = scaled.kind
+    steps, noise = found.residual_rows[used] / sd, noise[used][:, kind[:, None], kind]
+    covariance = np.einsum("nkp,nkl,nlq->pq", steps, noise, steps)
+    return EqualWeights(covariance, found.log_density)
 
 
 def excess(found: Influence, weight: Float[Array, "p p"]) -> tuple[float, float]:

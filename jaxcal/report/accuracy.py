@@ -24,7 +24,7 @@ from jaxcal.data.problem import Problem
 from jaxcal.data.recording import LARGEST, Recording
 from jaxcal.design.candidates import seen_region
 from jaxcal.design.constraints import Region
-from jaxcal.diagnostics.image_errors import Unknowns, error_sd
+from jaxcal.diagnostics.image_errors import Unknowns, noise_covariance
 from jaxcal.diagnostics.influence import (
     KINDS,
     Influence,
@@ -76,11 +76,13 @@ def accuracy_record(
         wanted: further image points for the error, in the images' own unit (px or mm).
 
     Returns:
-        Arrays and plain values; all of them None where X is not observable.
+        Arrays and plain values; all of them None where the calibration must not be used.
     """
     nothing = {"tre": None, "limits": None, "influence": None, "comparison": None}
     answer = result.numpy()
     if not np.isfinite(answer.unknowns_covariance).all() or not bool(result.converged):
+        return nothing
+    if result.wrong_frames is not None:
         return nothing
     problem = answer.problem
     if problem is None:
@@ -110,11 +112,12 @@ def as_solved(recording: Recording, answer: Calibration) -> Recording:
     images, problem = recording.calibration, answer.problem
     if problem is None:
         return recording
-    mask, measured = np.asarray(problem.mask) > 0, images.measurements
-    if images.kind != "time_of_flight":
-        measured = np.asarray(problem.measurements, float)
-    poses = np.asarray(problem.poses, float)
-    images = replace(images, poses=poses, measurements=measured, mask=mask)
+    images = replace(
+        images,
+        poses=np.asarray(problem.poses, float),
+        measurements=np.asarray(problem.measurements, float),
+        mask=np.asarray(problem.mask) > 0,
+    )
     return replace(recording, calibration=images)
 
 
@@ -259,7 +262,7 @@ def _comparison(
     images, problem = recording.calibration, answer.problem
     if answer.method == "conventional" or further or problem is None:
         return None
-    if images.kind == "time_of_flight" or answer.data == "channels":
+    if answer.data == "channels":
         return None
     used = np.asarray(answer.mask) > 0
     try:
@@ -274,10 +277,10 @@ def _comparison(
         further["scale"] = list(scale[:, None])
     alone = map_arrays(lambda leaf: np.asarray(leaf, float)[None], problem)
     unknowns = Unknowns(x[None, :3, :3], x[None, :3, 3], point[None], further)
-    sigma = np.asarray(error_sd(answer), float)
-    if not np.isfinite(sigma).all():
+    noise = np.asarray(noise_covariance(answer, problem), float)
+    if not np.isfinite(noise[used]).all():
         return None
-    fit = conventional_fit(unknowns, alone, answer.blocks, used, sigma)
+    fit = conventional_fit(unknowns, alone, answer.blocks, used, noise)
     jacobian = image_jacobian(answer, grid)
     error = np.einsum("mia,ab,mib->", jacobian, fit.covariance, jacobian) / len(grid)
     gaussian = np.einsum("mia,ab,mib->", jacobian, found.model_covariance, jacobian) / len(grid)

@@ -22,13 +22,13 @@ def certificate_record(result: Calibration, recording: Recording) -> dict[str, A
 
     For the conventional method they are those of the answer. The other methods minimise a different
     objective; for them they are those of the closed form on the same images. Both are None if there
-    is no closed form (e.g. an estimated delay, raw times of flight) or no answer.
+    is no closed form (e.g. an estimated delay) or no answer.
     """
     nothing: dict[str, Any] = {"certified": None, "gap_mm2": None}
     images = recording.calibration
     estimate = tuple(name for name in FURTHER if name in result.blocks)
     own = result.method == "conventional"
-    if images.kind == "time_of_flight" or not (estimate in ((), ("scale",)) or own):
+    if not (estimate in ((), ("scale",)) or own):
         return nothing
     try:
         # The solve counted every pose once, so the certificate must do the same.

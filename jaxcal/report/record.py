@@ -42,7 +42,8 @@ CONVENTION = {
     "sound speed over the nominal one",
     "tre": "target registration error: distance between the true and the calibrated place of an "
     "image point; rms_mm over the region and in points with 95 % intervals, stated_* as the "
-    "covariance has them, larger by factor where the data contradict it",
+    "covariance has them, larger by factor where the data contradict it; null where the "
+    "calibration is not to be used",
     "objective": "the minimised sum of squares: mm^2, or in SDs with the gaussian prior; with auto "
     "and uniform that of the Gaussian fit before the laws are weighed",
     "certified": "no transform fits Eq. 7 better (one part in 1e9), which is proved: of the answer "
@@ -73,8 +74,14 @@ def calibration_record(
         A dictionary that ``json.dumps(..., allow_nan=False)`` accepts.
 
     Raises:
-        InputError: test images that cannot be brought to mm (see :func:`check_test_images`).
+        InputError: times of flight, or test images that cannot be brought to mm (see
+            :func:`check_test_images`).
     """
+    if recording.calibration.kind == "time_of_flight":
+        raise InputError(
+            f"{recording.source}: the images hold times of flight, not points: give the recording "
+            "that jaxcal.segment_recording makes of them"
+        )
     answer = result.numpy()
     solved, tested = as_solved(recording, answer), check_test_images(recording, test)
     images = solved.calibration if tested is None else tested

@@ -102,7 +102,7 @@ def html_of(calibration: Calibration) -> str:
     record = record_of(calibration)
     lines = verdict(record)
     drawn, tre = "", record["tre"]
-    if not record["wrong_frames"] and tre is not None and tre.get("factor") is not None:
+    if tre is not None and tre.get("factor") is not None:
         answer, mapped = calibration.numpy(), tre["map"]
         images = recording_of(calibration).calibration
         used = images.poses[np.asarray(answer.mask) > 0]

@@ -128,9 +128,9 @@ def _facts(record: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def _accuracy(record: dict[str, Any]) -> list[tuple[str, str]]:
-    """The error to expect, over the image and at points; with wrong frames it is not known."""
+    """The error to expect, over the image and at points."""
     tre = record.get("tre")
-    if record["wrong_frames"] or tre is None or tre.get("rms_mm") is None:
+    if tre is None or tre.get("rms_mm") is None:
         return []
 
     def shown(error: float | None, interval: list[float | None]) -> str:

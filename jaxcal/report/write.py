@@ -112,7 +112,7 @@ def write_report(
 
     Returns:
         The files: calibration.json, verdict.txt, residuals.csv, and each figure as .png and .svg:
-        residuals and offsets; accuracy, influence and limits, if the answer is determined; and
+        residuals and offsets; accuracy, influence and limits, if the answer may be used; and
         convergence.
 
     Raises:
