@@ -199,7 +199,9 @@ def stated_before(result: Calibration, points: np.ndarray) -> float:
         result, blocks=result.blocks[:3],
         unknowns_covariance=result.unknowns_covariance[:, :9, :9],
     )  # fmt: skip
-    left = np.asarray(jnp.sum(result.mask > 0, axis=-1)) - unknowns.count_unknowns(result.blocks) / 3
+    left = (
+        np.asarray(jnp.sum(result.mask > 0, axis=-1)) - unknowns.count_unknowns(result.blocks) / 3
+    )
     factor = left / (left - 2) if result.prior == "none" else 1.0
     told = np.asarray(predicted_tre(alone, places(result, points)))
     return rms(np.sqrt(factor)[..., None] * told if result.prior == "none" else told)
