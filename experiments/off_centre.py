@@ -19,7 +19,8 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import arguments, experiments, machine, right_errors, write_rows
+from common import arguments, experiments, machine, right_errors, save_figure, write_rows
+from matplotlib.figure import Figure
 
 from jaxcal import Protocol, calibrate_batch, transform_intervals
 from jaxcal.diagnostics.intervals import tre_at
@@ -52,10 +53,32 @@ def moved(drawn: Experiment, mean: float) -> Experiment:
     )
 
 
+def draw(rows: list[dict[str, float]]) -> Figure:
+    """Coverage against the mean of the offsets, a line for each number of images and noise."""
+    figure = Figure(figsize=(6.0, 3.6), layout="constrained")
+    axes = figure.subplots()
+    for (images, noise), line in zip(itertools.product(SIZES, NOISES_MM), "so^v", strict=True):
+        shown = [row for row in rows if (row["images"], row["noise_mm"]) == (images, noise)]
+        axes.plot(
+            [row["mean_mm"] for row in shown],
+            [100 * row["cover_t_elevational"] for row in shown],
+            marker=line,
+            label=f"{images} images, ranges +- {shown[0]['range_sd_mm']:.2f} mm",
+        )
+    axes.axhline(95, color="0.5", linestyle=":", linewidth=1)
+    axes.set(
+        xlabel="mean of the offsets (mm), their SD is 1 mm",
+        ylabel="95 % intervals of X's elevational\ntranslation that hold (%)",
+        ylim=(0, 102),
+    )
+    axes.legend(loc="lower left", fontsize="small")
+    return figure
+
+
 def main() -> None:
     quick, folder = arguments(__doc__)
     trials = 50 if quick else TRIALS
-    rows: list[dict[str, object]] = []
+    rows: list[dict[str, float]] = []
     for condition, (images, noise) in enumerate(itertools.product(SIZES, NOISES_MM)):
         protocol = Protocol(
             images=images, test_images=2, elevation_distribution="normal", elevation_mm=SD_MM,
@@ -95,6 +118,7 @@ def main() -> None:
             )
             print(", ".join(f"{k} {v:.4g}" for k, v in rows[-1].items()), flush=True)
             write_rows(folder / "off_centre.csv", rows)
+    save_figure(draw(rows), folder / "off_centre.png", 150)
     print(machine())
 
 
