@@ -101,6 +101,7 @@ def compare(
     early = corpus.stopped_early(family, call.name, road)
     reasons = corpus.known_to_differ(family.name, call.name, road)
     known = np.isin(np.arange(len(family)), [*reasons])
+    flat = np.array([row for row, why in reasons.items() if why == corpus.FLAT], int)
     worst = corpus.differences(recorded, found)
     flips = corpus.flips(recorded, found)
     differs = np.isin(np.arange(len(family)), [row for rows in flips.values() for row in rows])
@@ -109,6 +110,9 @@ def compare(
         values = np.where(early, np.nan, values)
         limit = corpus.tolerance(family.name, call.name, name)
         differs |= np.nan_to_num(values, nan=0.0) > limit
+        for row in flat[np.nan_to_num(values[flat], nan=0.0) > corpus.FLAT_ALLOWANCE]:
+            passes = False
+            lines.append(f"  {name}: {values[row]:.2e} in problem {row}, more than rounding")
         values = np.where(known, np.nan, values)
         if np.isnan(values).all():
             continue
