@@ -1,4 +1,4 @@
-"""Padding to a bucket changes no answer, and one program serves every number of images in it."""
+"""Padding changes no answer, and one program serves every number of images of a size."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from jaxcal.calibration.engine import fill_up
 from jaxcal.data.problem import taken
 from jaxcal.runtime import executables
 from jaxcal.runtime.arrays import each_image, first_images
-from jaxcal.runtime.executables import bucket
+from jaxcal.runtime.executables import FEWEST_PADDED, bucket, padded_images
 
 METHODS: dict[str, dict] = {
     "alternating": {"method": "alternating", "max_elevation": 2.0},
@@ -42,6 +42,11 @@ def test_buckets_grow_by_a_half_or_a_third():
     assert all(bucket(n) <= 1.5 * n for n in range(8, 2000))
 
 
+def test_images_of_one_problem_double():
+    assert sorted({padded_images(n) for n in range(4, 513)}) == [64, 128, 256, 512]
+    assert all(n <= padded_images(n) < max(2 * n, FEWEST_PADDED + 1) for n in range(4, 2000))
+
+
 def test_every_axis_of_images_is_known(problems):
     """What holds a number for each image is padded and cut; nothing else is."""
     result = jaxcal.calibrate(problems[0], "conventional").numpy()
@@ -57,7 +62,7 @@ def test_every_axis_of_images_is_known(problems):
     assert cut.residual.shape == (9, 3)
     assert cut.inspection.outlier.shape == (9,)
     raw = jaxcal.simulate_recording(jaxcal.Protocol(images=9, raw=True), 1)
-    channels = fill_up(jaxcal.Problem.from_recording(raw)).channels
+    channels = fill_up(jaxcal.Problem.from_recording(raw), 12).channels
     assert channels is not None
     assert channels.distances.shape == channels.heard.shape == (12, 128)
     assert channels.elements.shape == (128, 3)
@@ -114,7 +119,7 @@ def same(one: jaxcal.Calibration, other: jaxcal.Calibration, images: int) -> Non
 
 @pytest.mark.parametrize("name", METHODS)
 def test_masked_images_beyond_the_bucket_change_nothing(name, problems):
-    """From 5 to 12 images, some of them masked, in the buckets of 12 and of 16.
+    """From 5 to 12 images, some of them masked, padded to 64 and to 128.
 
     The conventional method is compared with the problem without padding below.
     """
@@ -129,7 +134,7 @@ def test_masked_images_beyond_the_bucket_change_nothing(name, problems):
         source=st.sampled_from(sources),
         count=st.integers(9, 12),
         left_out=st.sets(st.integers(0, 11), max_size=4),
-        more=st.integers(1, 4),
+        more=st.integers(FEWEST_PADDED - 11, 2 * FEWEST_PADDED - 12),
     )
     def holds(source, count, left_out, more):
         count = min(count, source.images)
@@ -137,7 +142,7 @@ def test_masked_images_beyond_the_bucket_change_nothing(name, problems):
         mask = jnp.asarray([float(k not in left_out) for k in range(count)])
         problem = replace(problem, mask=mask)
         padded = with_garbage(problem, 12 - count + more)
-        assert bucket(padded.images) == 16
+        assert padded_images(padded.images) == 2 * FEWEST_PADDED
         same(jaxcal.calibrate(problem, **METHODS[name]), jaxcal.calibrate(padded, **METHODS[name]),
              count)  # fmt: skip
 

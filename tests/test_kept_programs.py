@@ -73,12 +73,12 @@ def test_the_cache_is_warmed_shown_and_cleared(capsys, monkeypatch):
         return capsys.readouterr().out
 
     warmed = command("warm", "--images", "5", "--images", "8", "--method", "alternating")
-    # Both numbers are of one bucket, and so one program.
-    assert warmed.splitlines()[0].startswith("alternating, up to 8 images: ")
+    # Both numbers are solved at one size, and so by one program.
+    assert warmed.splitlines()[0].startswith("alternating, up to 64 images: ")
     assert len(warmed.splitlines()) == 1
     shown = json.loads(command("show", "--json"))
     (row,) = shown["programs"]
-    assert (row["method"], row["images"], row["refused"]) == ("alternating", 8, False)
+    assert (row["method"], row["images"], row["refused"]) == ("alternating", 64, False)
     assert row["compile_s"] > 0
     assert row["bytes"] == shown["bytes"] > 1000
     page = command("show")

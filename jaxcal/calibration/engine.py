@@ -19,7 +19,7 @@ from jaxcal.data.problem import Problem, taken
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime import compiler, executables
 from jaxcal.runtime.arrays import assembled, first_images, map_arrays
-from jaxcal.runtime.executables import bucket
+from jaxcal.runtime.executables import bucket, padded_images
 from jaxcal.runtime.jax_modes import in_own_modes, inside_transformation
 from jaxcal.solvers.closed_form.single import closed_form_start
 from jaxcal.solvers.plan import Given, SolvePlan
@@ -74,8 +74,8 @@ def _solve_compiled(problem: Problem, given: Given, plan: SolvePlan) -> Calibrat
 
 
 def _solve_kept(problem: Problem, given: Given, plan: SolvePlan) -> Calibration:
-    """One problem by programs that are kept, which serve every number of images of a bucket."""
-    padded = fill_up(problem)
+    """One problem by programs that are kept, which serve many numbers of images."""
+    padded = fill_up(problem, padded_images(problem.images))
     run = partial(executables.run, flags=compiler.ONE_PROBLEM)
     label = _label(plan, padded.images)
     agreed, used = None, problem
@@ -92,9 +92,9 @@ def _solve_kept(problem: Problem, given: Given, plan: SolvePlan) -> Calibration:
     return as_jax_holds(first_images(result, problem.images), problem)
 
 
-def fill_up(problem: Problem) -> Problem:
-    """A problem or batch with masked images up to its bucket's size; numpy arrays if it grows."""
-    more = bucket(problem.images) - problem.images
+def fill_up(problem: Problem, images: int) -> Problem:
+    """A problem or batch with masked images up to that number; numpy arrays if it grows."""
+    more = images - problem.images
     if not more:
         return problem
     rows = [*range(problem.images), *[problem.images - 1] * more]  # a masked pose must be rigid
@@ -171,7 +171,7 @@ def _solve_chunks_kept(
     padded = problems
     if count <= FEW_PROBLEMS:
         # Here a person waits for the compiler; of thousands, masked images would cost run time.
-        padded = fill_up(problems)
+        padded = fill_up(problems, bucket(images))
     size = bucket(pieces) if pieces > 1 else 1
     done = last and size * chunk == count and padded.images == images
     if size * chunk != count:

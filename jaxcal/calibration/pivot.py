@@ -263,9 +263,9 @@ def _first_of_each(
 def _solve_kept(
     poses: Float[np.ndarray, "n 4 4"], mask: Float[np.ndarray, " n"], robust: bool
 ) -> Pivot:
-    """One calibration by a kept program, which solves every number of poses of its bucket."""
+    """One calibration by a kept program, which serves many numbers of poses."""
     count = len(mask)
-    padded = executables.bucket(count)
+    padded = executables.padded_images(count)
     rows = np.minimum(np.arange(padded), count - 1)  # masked poses must be valid, too
     weight = np.where(np.arange(padded) < count, mask[rows], 0.0)
     label = {"method": "pivot", "images": padded, "robust": robust}

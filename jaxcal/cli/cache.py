@@ -20,7 +20,7 @@ from jaxcal.solvers.names import Method
 if TYPE_CHECKING:
     from jaxcal.data.problem import Problem
 
-WARMED_IMAGES = (16, 32, 64)
+WARMED_IMAGES = (64,)
 """Numbers of images that ``warm`` prepares for, unless it is told others."""
 
 
@@ -72,7 +72,7 @@ def show(as_json: bool) -> int:
     show_default=True,
     metavar="N",
     help="Number of images; may be repeated. One program serves every number of images up to the "
-    "next of 8, 12, 16, 24, 32, 48, 64, 96, ...",
+    "next of 64, 128, 256, 512, ...",
 )
 @click.option(
     "--method",
@@ -106,12 +106,12 @@ def warm(
     except (OSError, RuntimeError) as error:
         raise OutputError(f"the cache cannot be used: {error}") from error
     from jaxcal.calibration.calibrate import calibrate, unknown_names
-    from jaxcal.runtime.executables import bucket
+    from jaxcal.runtime.executables import padded_images
 
     names = unknown_names(estimate)
     like = _problem(recording, "scale" in names)
     for method in methods:
-        for count in sorted({bucket(count) for count in images}):
+        for count in sorted({padded_images(count) for count in images}):
             with progress(f"compiling ({method}, {count} images)"):
                 began = time.perf_counter()
                 calibrate(_repeated(like, count), method, estimate=names)

@@ -14,8 +14,9 @@ Trees of arrays are described as JSON (:func:`describe`), so that neither pickle
 needed to put a result together. Programs that call functions outside XLA (LAPACK, callbacks) are
 compiled for this process only: the addresses mean nothing to another process.
 
-A few programs serve any number of images: callers pad their arrays to the size of a
-:func:`bucket` and cut the result. Padded images are masked, and no answer depends on them.
+A few programs serve any number of images: callers pad their arrays to the size of
+:func:`padded_images` for one problem or of a :func:`bucket` for a batch, and cut the result. Padded
+images are masked, and no answer depends on them.
 """
 
 from __future__ import annotations
@@ -50,7 +51,11 @@ LOADED = 32
 """Most programs kept in this process; the least recently used is dropped."""
 
 SMALLEST_BUCKET = 8
-"""Images of the smallest bucket."""
+"""Images or problems of the smallest bucket of a batch."""
+
+FEWEST_PADDED = 64
+"""One problem has at least so many images when it is solved. Padding from 12 to 64 costs a few ms,
+compiling another program costs seconds."""
 
 TRACED_THROUGH = ("jax", "jaxlib", "equinox", "optimistix", "numpy")
 """Packages whose versions change what is compiled."""
@@ -119,8 +124,16 @@ class _Program:
         )
 
 
+def padded_images(count: int) -> int:
+    """The number that the images of one problem are padded to: 64, 128, 256, 512, ..."""
+    return max(FEWEST_PADDED, 1 << (count - 1).bit_length())
+
+
 def bucket(count: int) -> int:
-    """The size that so many images or problems are padded to: 8, 12, 16, 24, 32, 48, 64, 96, ..."""
+    """The size that the problems of a batch, or their images, are padded to: 8, 12, 16, 24, 32, ...
+
+    Finer than that of one problem, since masked images cost a batch more time.
+    """
     size = SMALLEST_BUCKET
     while size < count:
         # Powers of two, and 1.5 times each of them.

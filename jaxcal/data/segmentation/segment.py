@@ -404,11 +404,11 @@ def fit_frames(distances: AnyArray, positions: AnyArray, how: tuple[bool, bool])
 def _fitted(
     distances: Float[np.ndarray, "n elements"], positions: np.ndarray, how: tuple[bool, bool]
 ) -> Fits:
-    """The fit; on a CPU by a kept program, which serves a bucket of frame counts."""
+    """The fit; on a CPU by a kept program, which serves many numbers of frames."""
     if jax.default_backend() != "cpu":
         return compiled_fit(*how)(distances, positions)
     count, elements = distances.shape
-    padded = np.full((executables.bucket(count), elements), np.nan)
+    padded = np.full((executables.padded_images(count), elements), np.nan)
     padded[:count] = distances
     found = executables.run(
         "jaxcal.data.segmentation.segment:fit_frames",
