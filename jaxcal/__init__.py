@@ -58,6 +58,7 @@ _HOME = {
     "calibrate_pivot": "jaxcal.calibration.pivot",
     "calibration_reproducibility": "jaxcal.diagnostics.metrics",
     "certify": "jaxcal.solvers.closed_form.certificate",
+    "compare_calibrations": "jaxcal.diagnostics.comparison",
     "cross_validate": "jaxcal.calibration.resampling",
     "load": "jaxcal.io.hdf5",
     "load_calibration": "jaxcal.result.saved",
@@ -93,6 +94,7 @@ if TYPE_CHECKING:
     from jaxcal.data.segmentation.segment import segment as segment
     from jaxcal.data.segmentation.segment import segment_recording as segment_recording
     from jaxcal.data.sound import sound_speed_in_water as sound_speed_in_water
+    from jaxcal.diagnostics.comparison import compare_calibrations as compare_calibrations
     from jaxcal.diagnostics.intervals import predicted_tre as predicted_tre
     from jaxcal.diagnostics.intervals import transform_intervals as transform_intervals
     from jaxcal.diagnostics.metrics import (

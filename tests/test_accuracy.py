@@ -21,9 +21,9 @@ from jaxcal.data.recording import Recording, make_images
 from jaxcal.diagnostics import influence as influences
 from jaxcal.diagnostics.influence import excess, in_image, influence_of
 from jaxcal.diagnostics.intervals import (
-    _length_quantile,
     error_covariance,
     image_jacobian,
+    length_quantile,
     tre_at,
     tre_over,
 )
@@ -75,7 +75,7 @@ def test_quantiles_of_an_error_against_draws(variances, freedom):
     if np.isfinite(freedom):
         length = length / np.sqrt(rng.chisquare(freedom, len(length)) / freedom)
     for chance in (0.025, 0.5, 0.975):
-        found = _length_quantile(np.array([variances]), freedom, chance)[0]
+        found = length_quantile(np.array([variances]), freedom, chance)[0]
         assert np.mean(length < found) == pytest.approx(chance, abs=0.002)
 
 

@@ -36,7 +36,7 @@ def test_quantiles_of_an_error_against_bisection(freedom):
         [draws, 1e-3 * draws**6, np.diag([1.0, 2.0, 3.0]), [[1, 1, 0], [1, 1e-9, 1e-12], [0, 0, 0]]]
     )
     for chance in (0.025, 0.5, 0.975):
-        found = intervals._length_quantile(variances, freedom, chance)
+        found = intervals.length_quantile(variances, freedom, chance)
         expected = [bisected(row, freedom, chance) if row.any() else 0.0 for row in variances]
         np.testing.assert_allclose(found, expected, rtol=1e-9)
 
@@ -54,5 +54,5 @@ def test_quantiles_are_as_right_as_their_module_says(dimensions, freedom):
                 square = alike * special.fdtri(alike, freedom, chance)
             if chance < 0.5 and alike == 1:
                 right = max(right, 0.06)
-            found = intervals._length_quantile(variances, freedom, chance)
+            found = intervals.length_quantile(variances, freedom, chance)
             np.testing.assert_allclose(found, np.sqrt(square), rtol=right)

@@ -173,6 +173,7 @@ problem = jaxcal.Problem.from_arrays(poses, points)
 result = jaxcal.calibrate(problem, "conventional")
 probe = jaxcal.LinearProbe(elements=16)
 raw = jaxcal.make_images(poses, np.full((9, 16), 2e-5), "time_of_flight")
+mapping = jaxcal.ImageTransform(np.eye(4))
 found = jaxcal.calibrate(jaxcal.simulate_recording(jaxcal.Protocol(images=9), 1), "conventional")
 of_one = backend.Parameters.of(jax.numpy.eye(3), jax.numpy.zeros(3), jax.numpy.zeros(3))
 skewed = np.eye(6) + np.eye(6, k=1)
@@ -217,6 +218,8 @@ for call, *given in (
     (jaxcal.reconstruction_precision, np.eye(4), poses[:1], points),
     (jaxcal.calibration_reproducibility, np.eye(4), [[0.0, 20.0]]),
     (jaxcal.calibration_reproducibility, [np.eye(4)], [[0.0, 20.0]]),
+    (jaxcal.compare_calibrations, "first.json", "second.json", points),
+    (jaxcal.compare_calibrations, mapping, mapping, [[0.0, 20.0, 1.0]]),
     (jaxcal.certify, problem, result.image_to_probe, [1.0]), (jaxcal.calibrate_closed_form, 3),
     (jaxcal.LinearProbe, 2.5), (jaxcal.LinearProbe, "64"),
     (jaxcal.CurvilinearProbe, 64, [1.0, 2.0]),
@@ -333,7 +336,7 @@ for call, *given in (
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stderr == ""
     lines = done.stdout.splitlines()
-    assert len(lines) == 191
+    assert len(lines) == 193
     assert lines[0].startswith("jaxcal.calibrate takes a problem, not a path: ")
     assert lines[3].startswith("jaxcal.calibrate_batch takes a problem or a recording, not int: ")
     assert lines[4] == "points must have shape (..., 2), not (1, 3)"
@@ -342,7 +345,7 @@ for call, *given in (
     assert lines[27] == "poses must be an array of real numbers"
     assert lines[29] == "kind must be one of point, pixel, time_of_flight, not 'pixels'"
     assert lines[30] == "measurements must not hold masked entries: leave those rows out (mask=)"
-    assert lines[50] == "tolerance_mm must be finite and positive, in mm, not '0.1'"
+    assert lines[52] == "tolerance_mm must be finite and positive, in mm, not '0.1'"
     assert lines[53] == "max_rounds must be a whole number, not 2.5"
     assert lines[59] == (
         "options must be made by jaxcal.Options, e.g. jaxcal.Options(max_rounds=100), not "

@@ -12,6 +12,7 @@ from jaxcal.cli.apply import apply
 from jaxcal.cli.cache import cache
 from jaxcal.cli.calibrate import calibrate
 from jaxcal.cli.common import Commands
+from jaxcal.cli.compare import compare
 from jaxcal.cli.demo import demo
 from jaxcal.cli.export import export
 from jaxcal.cli.import_ import import_
@@ -46,6 +47,7 @@ for _command in (
     calibrate,
     export,
     apply,
+    compare,
     serve,
     plan,
     pivot,

@@ -10,6 +10,7 @@
     warnings         everything that a person should know before using an answer
     intervals        confidence intervals and target registration error
     metrics          reconstruction precision, reproducibility
+    comparison       whether two calibrations of one probe agree
 
 A solve itself leaves X, target, offsets, SDs, covariance and status
 (:mod:`jaxcal.calibration.answer`).

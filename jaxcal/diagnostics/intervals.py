@@ -314,16 +314,22 @@ def _errors(
     for each in np.unique(freedom):
         rows = np.asarray(freedom == each)
         for chance, out in ((0.5 - 0.5 * LEVEL, lower), (0.5 + 0.5 * LEVEL, upper)):
-            out[rows] = _length_quantile(flat[rows], float(each), chance)
+            out[rows] = length_quantile(flat[rows], float(each), chance)
     rms = np.sqrt(factor * values.sum(axis=-1))
     found = rms, lower.reshape(left.shape), upper.reshape(left.shape)
     return tuple(np.where(finite, value, np.nan) for value in found)  # pyright: ignore[reportReturnType]
 
 
-def _length_quantile(
+def length_quantile(
     variances: Float[np.ndarray, "m k"], freedom: float, chance: float
 ) -> Float[np.ndarray, " m"]:
-    """Quantile of the length of vectors with these variances along their axes."""
+    """Quantile of the length of vectors with these variances along their axes.
+
+    Args:
+        variances: of each vector, along its principal axes.
+        freedom: degrees of freedom of Student's distribution; inf: the vectors are normal.
+        chance: the probability that a length is below the quantile.
+    """
     dimensions = variances.shape[1]
     total = variances.sum(axis=1)
     shares = np.where(total[:, None] > 0, variances, 1.0)

@@ -253,6 +253,26 @@ def load_calibration(path: str | os.PathLike[str]) -> ImageTransform:
         return transform_from_record(_json_object(path), source=name)
 
 
+def stated_points(path: str | os.PathLike[str]) -> np.ndarray | None:
+    """The image points at which a JSON of ours states its error: middle and corners, (m, 2).
+
+    They are in px, or mm where the calibration has no pixels; None if the file holds none.
+
+    Raises:
+        FormatError: a ``.json`` that is no JSON object.
+    """
+    if not path_name(path).lower().endswith(".json"):
+        return None
+    with naming(path):
+        stated = _json_object(path).get("tre")
+    try:
+        points = np.array([each["image"] for each in stated["points"]], dtype=np.float64)  # pyright: ignore[reportOptionalSubscript]
+    except (TypeError, KeyError, ValueError, OverflowError):
+        return None
+    sound = points.ndim == 2 and points.shape[1] == 2 and np.isfinite(points).all()
+    return points if sound else None
+
+
 def _load_npy(path: str | os.PathLike[str]) -> np.ndarray:
     check_readable(path, maximum_bytes=4096)
     try:

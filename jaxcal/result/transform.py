@@ -216,27 +216,19 @@ class ImageTransform:
             InputError: shapes that do not agree, NaN or numbers over 1e9, a negative SD, or a pose
                 that is not rigid.
         """
-        measured = real_array(pixels, "pixels")
-        measured = measured[None] if measured.ndim == 1 else measured
-        if measured.ndim != 2 or measured.shape[1] != 2:
-            raise InputError(f"pixels must have shape (n, 2), not {measured.shape}")
         own = real_array(pixel_sd_px, "pixel_sd_px")
         if own.shape not in ((), (2,)):
             raise InputError(f"pixel_sd_px must be one number or two, not of shape {own.shape}")
         # Written so that NaN is refused, too.
-        if not (np.abs(measured) <= _LARGEST).all():
-            raise InputError(f"pixels must be numbers up to {_LARGEST:g}, not NaN or Inf")
         if not ((own >= 0) & (own <= _LARGEST)).all():
             raise InputError(f"pixel_sd_px must be from 0 to {_LARGEST:g}")
-        count = len(measured)
-        scale = np.ones(2) if self.scale_mm_per_px is None else self.scale_mm_per_px
-        plane = np.zeros((count, 3))
-        plane[:, 0] = scale[0] * measured[:, 0]
-        scale = scale * np.array([1.0, self.range_factor])
-        plane[:, 2] = scale[1] * measured[:, 1] + self.face_offset_mm
-        rotation = self.image_plane_to_probe[:3, :3]
+        plane = self._in_plane(pixels)
+        count, rotation = len(plane), self.image_plane_to_probe[:3, :3]
         points = plane @ rotation.T + self.image_plane_to_probe[:3, 3]
-        covariance = self._covariance(plane, rotation, scale, own)
+        factor = self._error_factor(plane)
+        spread = np.zeros(3)
+        spread[[0, 2]] = own * self._mm_per_px()
+        covariance = factor @ factor.swapaxes(1, 2) + rotation @ np.diag(spread**2) @ rotation.T
         if pose is None:
             return AppliedPoints(points, covariance)
         given = real_array(pose, "pose")
@@ -248,24 +240,49 @@ class ImageTransform:
         points = np.einsum("nij,nj->ni", turn, points) + poses[:, :3, 3]
         return AppliedPoints(points, turn @ covariance @ turn.swapaxes(1, 2))
 
-    def _covariance(
-        self,
-        plane: Float[np.ndarray, "n 3"],
-        rotation: Float[np.ndarray, "3 3"],
-        scale: Float[np.ndarray, 2],
-        pixel_sd: Float[np.ndarray, "*two"],
-    ) -> Float[np.ndarray, "n 3 3"]:
-        """R (J C J' + S) R', in the probe's frame; J is :mod:`jaxcal.model.image_points`'."""
+    def error_factor(self, pixels: np.ndarray) -> Float[np.ndarray, "n 3 q"]:
+        """F with F z the errors of image points in the probe's frame, mm; z are standard normals.
+
+        The errors of all points come from the same z: those of the calibration's unknowns. F F' of
+        a point is its covariance in :meth:`apply`; NaN where the calibration's is not known.
+
+        Args:
+            pixels: as in :meth:`apply`.
+
+        Raises:
+            InputError: as :meth:`apply`.
+        """
+        return self._error_factor(self._in_plane(pixels))
+
+    def _mm_per_px(self) -> Float[np.ndarray, 2]:
+        """Size of a pixel at the estimated sound speed; 1 across where points are in mm."""
+        scale = np.ones(2) if self.scale_mm_per_px is None else self.scale_mm_per_px
+        return scale * np.array([1.0, self.range_factor])
+
+    def _in_plane(self, pixels: np.ndarray) -> Float[np.ndarray, "n 3"]:
+        """Image points in the image frame, mm."""
+        measured = real_array(pixels, "pixels")
+        measured = measured[None] if measured.ndim == 1 else measured
+        if measured.ndim != 2 or measured.shape[1] != 2:
+            raise InputError(f"pixels must have shape (n, 2), not {measured.shape}")
+        # Written so that NaN is refused, too.
+        if not (np.abs(measured) <= _LARGEST).all():
+            raise InputError(f"pixels must be numbers up to {_LARGEST:g}, not NaN or Inf")
+        plane = np.zeros((len(measured), 3))
+        plane[:, [0, 2]] = self._mm_per_px() * measured + np.array([0.0, self.face_offset_mm])
+        return plane
+
+    def _error_factor(self, plane: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 q"]:
+        """R J C^1/2; J is :mod:`jaxcal.model.image_points`'."""
         covariance, blocks = self.image_covariance, self.unknowns
         if covariance is None:
             covariance, blocks = self.covariance, ("translation", "rotation")
         if covariance is None:
-            return np.full((len(plane), 3, 3), np.nan)
+            return np.full((len(plane), 3, 6), np.nan)
+        values, vectors = np.linalg.eigh(covariance)
+        root = vectors * np.sqrt(np.maximum(values, 0.0))
         jacobian = point_jacobian(plane[:, [0, 2]], blocks, self.face_offset_mm, self.range_factor)
-        own = np.zeros(3)
-        own[[0, 2]] = pixel_sd * scale
-        inner = jacobian @ covariance @ jacobian.swapaxes(1, 2) + np.diag(own**2)
-        return rotation @ inner @ rotation.T
+        return self.image_plane_to_probe[:3, :3] @ jacobian @ root
 
     def _scale(self) -> Float[np.ndarray, 2]:
         if self.scale_mm_per_px is None:

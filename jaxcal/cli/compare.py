@@ -1,0 +1,160 @@
+"""``jaxcal compare``: do calibrations of one probe agree?"""
+
+from __future__ import annotations
+
+from itertools import combinations
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from jaxcal.cli.common import ExitCode, json_option, print_json, print_page
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from jaxcal.diagnostics.comparison import Comparison
+
+MOST_FILES = 100
+"""Most calibrations that are compared at once, each with each."""
+
+
+@click.command(short_help="Compare calibrations of one probe: do they agree?")
+@click.argument("calibrations", type=click.Path(), metavar="CAL CAL ...", nargs=-1, required=True)
+@click.option(
+    "--pixel",
+    type=float,
+    nargs=2,
+    multiple=True,
+    metavar="U V",
+    help="An image point, px (mm without pixels); may be repeated. By default the middle and the "
+    "corners of the image, as far as it was used for the first CAL that knows them.",
+)
+@json_option
+def compare(
+    calibrations: tuple[str, ...], pixel: tuple[tuple[float, float], ...], as_json: bool
+) -> int:
+    """How far apart calibrations put the same image points, and how far their errors would.
+
+    Each CAL is a calibration.json of "jaxcal calibrate --out", or any other file that "jaxcal
+    export" writes. They must be of the same probe and marker, from different recordings. The status
+    is 5 if two of them are farther apart than 95 % of such pairs would be by their covariances.
+    """
+    import numpy as np
+
+    from jaxcal import InputError
+    from jaxcal.diagnostics.comparison import compare_calibrations
+    from jaxcal.result.saved import load_calibration, stated_points
+
+    if not 2 <= len(calibrations) <= MOST_FILES:
+        raise click.UsageError(f"name 2 to {MOST_FILES} calibrations, not {len(calibrations)}")
+    points = np.array(pixel) if pixel else None
+    for name in calibrations:
+        points = stated_points(name) if points is None else points
+    if points is None:
+        raise InputError(
+            "none of these files says which part of the image was used: name points of the image "
+            "by --pixel U V"
+        )
+    transforms = [load_calibration(name) for name in calibrations]
+    pairs = [
+        (
+            calibrations[a],
+            calibrations[b],
+            compare_calibrations(transforms[a], transforms[b], points),
+        )
+        for a, b in combinations(range(len(transforms)), 2)
+    ]
+    if as_json:
+        print_json({"pairs": [_record(*pair) for pair in pairs]})
+    elif len(pairs) == 1:
+        unit = "mm" if transforms[0].scale_mm_per_px is None else "px"
+        print_page(_table_of_points(pairs[0][2], unit), _sentence(pairs[0][2]))
+    else:
+        print_page(_table_of_pairs(pairs), _summary([pair[2] for pair in pairs]))
+    apart = any(pair[2].agree is False for pair in pairs)
+    return ExitCode.UNCERTAIN if apart else ExitCode.CONVERGED
+
+
+def _record(first: str, second: str, found: Comparison) -> dict[str, Any]:
+    def number(value: float) -> float | None:
+        return value if value == value else None
+
+    return {
+        "first": first,
+        "second": second,
+        "points": found.points.tolist(),
+        "apart_mm": found.apart_mm.tolist(),
+        "expected_mm": [number(value) for value in found.expected_mm.tolist()],
+        "rms_mm": found.rms_mm,
+        "expected_rms_mm": number(found.expected_rms_mm),
+        "limit_95_mm": number(found.limit_mm),
+        "rotation_deg": found.rotation_deg,
+        "agree": found.agree,
+    }
+
+
+def _millimetres(value: float) -> str:
+    return f"{value:.2f}" if value == value else "-"
+
+
+def _table(*headings: str) -> Table:
+    from rich import box
+    from rich.table import Table
+
+    table = Table(box=box.SIMPLE)
+    for heading in headings:
+        table.add_column(heading, justify="right" if "(" in heading else "left")
+    return table
+
+
+def _table_of_points(found: Comparison, unit: str) -> Table:
+    table = _table(f"image point ({unit})", "apart (mm)", "expected, RMS (mm)")
+    for (u, v), apart, expected in zip(
+        found.points, found.apart_mm, found.expected_mm, strict=True
+    ):
+        table.add_row(f"{u:.0f}, {v:.0f}", _millimetres(apart), _millimetres(expected))
+    table.add_row("RMS of all", _millimetres(found.rms_mm), _millimetres(found.expected_rms_mm))
+    return table
+
+
+def _table_of_pairs(pairs: list[tuple[str, str, Comparison]]) -> Table:
+    table = _table(
+        "first", "second", "apart, RMS (mm)", "expected (mm)", "95 % below (mm)", "agree"
+    )
+    words = {True: "yes", False: "no", None: "-"}
+    for first, second, found in pairs:
+        numbers = (found.rms_mm, found.expected_rms_mm, found.limit_mm)
+        table.add_row(first, second, *map(_millimetres, numbers), words[found.agree])
+    return table
+
+
+def _sentence(found: Comparison) -> str:
+    apart = (
+        f"image points are {found.rms_mm:.2f} mm apart (RMS), and the two images are turned by "
+        f"{found.rotation_deg:.2f} degrees against each other"
+    )
+    if found.agree is None:
+        return (
+            f"{apart[0].upper()}{apart[1:]}. How far apart they should be is not known: a file "
+            "holds no covariance."
+        )
+    limit = f"By both covariances 95 % of such pairs are less than {found.limit_mm:.2f} mm apart."
+    if found.agree:
+        return f"The calibrations agree: {apart}. {limit}"
+    return (
+        f"The calibrations do not agree: {apart}. {limit} At least one is less accurate than it "
+        "states, or the probe's marker or the geometry of its image changed in between."
+    )
+
+
+def _summary(found: list[Comparison]) -> str:
+    known = [each for each in found if each.agree is not None]
+    worst = max(each.rms_mm for each in found)
+    largest = f"The two that differ most put the image {worst:.2f} mm apart (RMS)"
+    if not known:
+        return f"{largest}. How far apart they should be is not known: no covariances."
+    apart = sum(not each.agree for each in known)
+    return (
+        f"{largest}. {apart} of {len(known)} pairs are farther apart than 95 % of such pairs would "
+        f"be by their covariances; about {0.05 * len(known):.1f} are expected by chance."
+    )

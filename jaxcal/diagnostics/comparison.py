@@ -1,0 +1,109 @@
+"""Do two calibrations of one probe agree? The same image points by both of them. Numpy only.
+
+Each puts an image point somewhere on the probe. To first order in their errors d_1 and d_2, with
+the derivatives D of a point by the unknowns, the two places are
+
+    D_1 d_1 - D_2 d_2
+
+apart if both estimate the same transform. The root mean square of this over the points is the
+length of a normal vector, whose quantiles :mod:`jaxcal.diagnostics.intervals` computes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import inf
+
+import numpy as np
+
+from jaxcal import InputError
+from jaxcal.data.poses import rotation_angle
+from jaxcal.diagnostics.intervals import LEVEL, length_quantile
+from jaxcal.result.transform import ImageTransform
+from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.given_values import check_made
+
+_LEAST_SHARE = 1e-6
+"""Least share of the mean square at which a direction of the errors counts."""
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Two calibrations at the same image points.
+
+    Attributes:
+        points: (m, 2) image points, px, or [lateral, range] in mm where there are no pixels.
+        apart_mm: (m,) how far apart the two calibrations put each point, mm.
+        expected_mm: (m,) its root mean square by both covariances, mm; NaN where one is not known.
+        rms_mm: root mean square of ``apart_mm``, mm.
+        expected_rms_mm: the same of ``expected_mm``, mm.
+        limit_mm: ``rms_mm`` of 95 % of such pairs is less than this by both covariances, mm.
+        rotation_deg: angle between the two orientations of the image, degrees.
+    """
+
+    points: Float[np.ndarray, "m 2"]
+    apart_mm: Float[np.ndarray, " m"]
+    expected_mm: Float[np.ndarray, " m"]
+    rms_mm: float
+    expected_rms_mm: float
+    limit_mm: float
+    rotation_deg: float
+
+    @property
+    def agree(self) -> bool | None:
+        """Whether they are less than ``limit_mm`` apart; None if a covariance is not known."""
+        return None if np.isnan(self.limit_mm) else bool(self.rms_mm <= self.limit_mm)
+
+
+def compare_calibrations(
+    first: ImageTransform, second: ImageTransform, points: Float[np.ndarray, "m 2"]
+) -> Comparison:
+    """Map the same image points by two calibrations of one probe, and compare.
+
+    The calibrations must come from different recordings: otherwise they share their errors, and are
+    nearer to each other than is expected here. The marker on the probe must be the same.
+
+    Args:
+        first: a calibration, e.g. from :func:`jaxcal.load_calibration`.
+        second: another one; both take pixels, or both points in mm.
+        points: [u, v] of image points, px, or [lateral, range] in mm.
+
+    Raises:
+        InputError: what is no calibration, one that must not be used, only one that takes pixels,
+            or points that :meth:`ImageTransform.apply` refuses.
+    """
+    for name, each in (("first", first), ("second", second)):
+        check_made(name, each, ImageTransform, "jaxcal.load_calibration")
+        each.check_usable()
+    if (first.scale_mm_per_px is None) != (second.scale_mm_per_px is None):
+        without, other = first, second
+        if second.scale_mm_per_px is None:
+            without, other = second, first
+        raise InputError(
+            f"{without.source} takes points in mm, {other.source} pixels: the same image points "
+            "cannot be given to both"
+        )
+    one, other = first.apply(points), second.apply(points)
+    points = np.asarray(points, float)
+    apart = np.linalg.norm(one.points - other.points, axis=1)
+    variances = np.trace(one.covariance + other.covariance, axis1=1, axis2=2)
+    limit = np.nan
+    if np.isfinite(variances).all():
+        # The root mean square is the length of this matrix times standard normals.
+        factors = [each.error_factor(points) for each in (first, second)]
+        factor = np.concatenate([each.reshape(-1, each.shape[-1]) for each in factors], axis=1)
+        spread = np.linalg.eigvalsh(factor.T @ factor / len(points))
+        # Both move the points alike, so that half of these directions do nothing.
+        spread = spread[spread >= _LEAST_SHARE * spread.sum()]
+        limit = length_quantile(spread[None], inf, LEVEL)[0]
+    return Comparison(
+        points=points,
+        apart_mm=apart,
+        expected_mm=np.sqrt(variances),
+        rms_mm=float(np.sqrt(np.mean(apart**2))),
+        expected_rms_mm=float(np.sqrt(np.mean(variances))),
+        limit_mm=float(limit),
+        rotation_deg=float(
+            np.degrees(rotation_angle(first.image_plane_to_probe, second.image_plane_to_probe))
+        ),
+    )

@@ -1,0 +1,172 @@
+"""Do two calibrations of one probe agree? ``jaxcal compare`` and what it computes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
+
+import jaxcal
+from jaxcal import ImageTransform, InputError, compare_calibrations
+from jaxcal.cli.main import main
+
+POINTS = np.array([[100.0, 300.0], [10, 10], [390, 10], [10, 490], [390, 490]])
+SCALE = np.array([0.1, 0.12])
+
+
+def place() -> np.ndarray:
+    transform = np.eye(4)
+    transform[:3, :3] = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()
+    transform[:3, 3] = 10.0, 20.0, -30.0
+    return transform
+
+
+def twist(step: np.ndarray) -> np.ndarray:
+    """Exp([v, omega]), also of many."""
+    generator = np.zeros((*step.shape[:-1], 4, 4))
+    generator[..., :3, 3] = step[..., :3]
+    for k, (i, j) in enumerate(((2, 1), (0, 2), (1, 0))):
+        generator[..., i, j], generator[..., j, i] = step[..., 3 + k], -step[..., 3 + k]
+    return expm(generator)
+
+
+def test_a_shift_and_a_turn_are_what_they_are():
+    first = ImageTransform(place(), SCALE)
+    shifted = ImageTransform(place() @ twist(np.array([0, 3.0, 0, 0, 0, 0])), SCALE)
+    found = compare_calibrations(first, shifted, POINTS)
+    np.testing.assert_allclose(found.apart_mm, 3.0)
+    assert found.rms_mm == pytest.approx(3.0)
+    assert found.rotation_deg == pytest.approx(0.0, abs=1e-9)
+    assert found.agree is None
+    assert np.isnan([found.limit_mm, found.expected_rms_mm, *found.expected_mm]).all()
+    turned = ImageTransform(place() @ twist(np.array([0, 0, 0, 0, 0, 0.1])), SCALE)
+    found = compare_calibrations(first, turned, POINTS[2:3])
+    # About the axial axis, by the lateral position of 39 mm.
+    assert found.apart_mm == pytest.approx([2 * 39.0 * np.sin(0.05)])
+    assert found.rotation_deg == pytest.approx(np.degrees(0.1))
+
+
+def test_nineteen_of_twenty_pairs_with_right_covariances_agree():
+    """The errors of X and of the pixel size are correlated, and those of one are twice the other's.
+
+    Of 4,000 pairs the standard error of the share is 0.3 %. The limit is that of the truth.
+    """
+    draws = np.random.default_rng(0)
+    factor = np.tril(0.3 * draws.normal(size=(8, 8)), -1) + np.eye(8)
+    factor = np.array([0.1, 0.5, 0.1, 0.008, 0.002, 0.004, 0.01, 0.008])[:, None] * factor
+    covariance = factor @ factor.T
+
+    def with_errors_of(size: float) -> ImageTransform:
+        return ImageTransform(
+            place(),
+            SCALE,
+            unknowns=("translation", "rotation", "scale"),
+            covariance=size**2 * covariance[:6, :6],
+            image_covariance=size**2 * covariance,
+        )
+
+    def placed(size: float) -> np.ndarray:
+        error = size * draws.normal(size=(4000, 8)) @ factor.T
+        u, v = np.moveaxis(POINTS * SCALE * np.exp(error[:, None, 6:]), -1, 0)
+        in_plane = np.stack([u, 0 * u, v, np.ones_like(u)], axis=-1)
+        return in_plane @ np.swapaxes(place() @ twist(error[:, :6]), -1, -2)
+
+    found = compare_calibrations(with_errors_of(1.0), with_errors_of(2.0), POINTS)
+    assert found.agree
+    apart = np.linalg.norm(placed(1.0) - placed(2.0), axis=2)
+    share = np.mean(np.sqrt(np.mean(apart**2, axis=1)) <= found.limit_mm)
+    assert share == pytest.approx(0.95, abs=0.015)
+    expected = found.expected_mm
+    np.testing.assert_allclose(np.sqrt(np.mean(apart**2, axis=0)), expected, rtol=0.05)
+    assert found.expected_rms_mm == pytest.approx(np.sqrt(np.mean(expected**2)))
+
+
+def test_what_cannot_be_compared_is_refused():
+    pixels = ImageTransform(place(), SCALE, source="px.json")
+    points = ImageTransform(place(), source="mm.json")
+    for pair in ((pixels, points), (points, pixels)):
+        with pytest.raises(InputError, match=r"mm\.json takes points in mm, px\.json pixels"):
+            compare_calibrations(*pair, POINTS)
+    with pytest.raises(InputError, match=r"bad\.json: must not be used"):
+        compare_calibrations(
+            pixels, ImageTransform(place(), SCALE, converged=False, source="bad.json"), POINTS
+        )
+
+
+@pytest.fixture
+def files(tmp_path) -> list[str]:
+    """Three calibrations: two agree, one is 5 mm away."""
+    covariance = np.diag([0.3, 0.3, 0.3, 0.004, 0.004, 0.004]) ** 2
+    names = []
+    for k, step in enumerate((0.0, 0.2, 5.0)):
+        transform = place() @ twist(np.array([step, 0, 0, 0, 0, 0]))
+        names.append(str(tmp_path / f"{k}.json"))
+        ImageTransform(transform, SCALE, covariance=covariance).save(names[-1])
+    return names
+
+
+PIXELS = ("--pixel", "100", "300", "--pixel", "390", "490")
+
+
+def test_the_command_tells_who_agrees(files, capsys):
+    assert main(["compare", *files[:2], *PIXELS]) == 0
+    page = " ".join(capsys.readouterr().out.split())
+    assert "The calibrations agree: image points are 0.20 mm apart (RMS)" in page
+    assert main(["compare", *files[1:], *PIXELS]) == 5
+    page = " ".join(capsys.readouterr().out.split())
+    assert "do not agree: image points are 4.80 mm apart" in page
+    assert "less accurate than it states" in page
+    assert main(["compare", *files, *PIXELS]) == 5
+    page = " ".join(capsys.readouterr().out.split())
+    assert "2 of 3 pairs are farther apart than 95 %" in page
+    assert main(["compare", *files, *PIXELS, "--json"]) == 5
+    pairs = json.loads(capsys.readouterr().out)["pairs"]
+    assert [pair["agree"] for pair in pairs] == [True, False, False]
+    assert pairs[0]["points"] == [[100, 300], [390, 490]]
+
+
+def test_without_covariances_nothing_is_claimed(files, tmp_path, capsys):
+    plain = str(tmp_path / "plain.tfm")
+    ImageTransform(place(), SCALE).save(plain)
+    assert main(["compare", files[2], plain, *PIXELS]) == 0
+    assert "How far apart they should be is not known" in " ".join(capsys.readouterr().out.split())
+    assert main(["compare", files[2], plain, *PIXELS, "--json"]) == 0
+    (pair,) = json.loads(capsys.readouterr().out)["pairs"]
+    assert (pair["agree"], pair["limit_95_mm"], pair["expected_mm"]) == (None, None, [None, None])
+
+
+def test_points_are_those_of_the_first_record_that_states_its_error(files, capsys):
+    assert main(["compare", *files[:2]]) == 2
+    assert "name points of the image by --pixel" in capsys.readouterr().err
+    assert main(["compare", files[0]]) == 2
+    record = json.loads(Path(files[1]).read_text())
+    stated = [{"name": "middle", "image": point} for point in POINTS.tolist()]
+    Path(files[1]).write_text(json.dumps(record | {"tre": {"points": stated}}))
+    assert main(["compare", *files[:2], "--json"]) == 0
+    (pair,) = json.loads(capsys.readouterr().out)["pairs"]
+    assert pair["points"] == POINTS.tolist()
+    for nonsense in ({"points": [{"image": [1, None]}]}, {"points": 3}, [], {"points": []}):
+        Path(files[1]).write_text(json.dumps(record | {"tre": nonsense}))
+        assert main(["compare", *files[:2]]) == 2
+        assert "name points of the image" in capsys.readouterr().err
+
+
+def test_calibrations_of_other_images_of_one_probe_agree(tmp_path, capsys):
+    """As a person makes them; ``calibrate --out`` says where the image was used."""
+    from jaxcal.data.problem import taken
+
+    whole = jaxcal.Problem.from_recording(
+        jaxcal.simulate_recording(jaxcal.Protocol(images=24, test_images=0), 3)
+    )
+    names = []
+    for half in (range(0, 24, 2), range(1, 24, 2)):
+        names.append(str(tmp_path / f"{half.start}.json"))
+        jaxcal.calibrate(taken(whole, [*half]), "conventional").save(names[-1])
+    assert main(["compare", *names, "--json"]) == 0
+    (pair,) = json.loads(capsys.readouterr().out)["pairs"]
+    assert len(pair["points"]) == 5
+    assert 0.1 < pair["rms_mm"] / pair["expected_rms_mm"] < 2.0
