@@ -218,8 +218,6 @@ for call, *given in (
     (jaxcal.reconstruction_precision, np.eye(4), poses[:1], points),
     (jaxcal.calibration_reproducibility, np.eye(4), [[0.0, 20.0]]),
     (jaxcal.calibration_reproducibility, [np.eye(4)], [[0.0, 20.0]]),
-    (jaxcal.compare_calibrations, "first.json", "second.json", points),
-    (jaxcal.compare_calibrations, mapping, mapping, [[0.0, 20.0, 1.0]]),
     (jaxcal.certify, problem, result.image_to_probe, [1.0]), (jaxcal.calibrate_closed_form, 3),
     (jaxcal.LinearProbe, 2.5), (jaxcal.LinearProbe, "64"),
     (jaxcal.CurvilinearProbe, 64, [1.0, 2.0]),
@@ -325,6 +323,8 @@ for call, *given in (
     (lambda probe: LiveCalibration(probe=probe), "linear"),
     (LiveCalibration().add, np.eye(4), "0 50"), (LiveCalibration().leave_out, "a"),
     (lambda bound: LiveCalibration().put(np.eye(4), points[0], bound), "one"),
+    (jaxcal.compare_calibrations, "first.json", "second.json", points),
+    (jaxcal.compare_calibrations, mapping, mapping, [[0.0, 20.0, 1.0]]),
 ):
     try:
         call(*given)
@@ -345,7 +345,7 @@ for call, *given in (
     assert lines[27] == "poses must be an array of real numbers"
     assert lines[29] == "kind must be one of point, pixel, time_of_flight, not 'pixels'"
     assert lines[30] == "measurements must not hold masked entries: leave those rows out (mask=)"
-    assert lines[52] == "tolerance_mm must be finite and positive, in mm, not '0.1'"
+    assert lines[50] == "tolerance_mm must be finite and positive, in mm, not '0.1'"
     assert lines[53] == "max_rounds must be a whole number, not 2.5"
     assert lines[59] == (
         "options must be made by jaxcal.Options, e.g. jaxcal.Options(max_rounds=100), not "
