@@ -218,7 +218,7 @@ def test_whitened_errors_are_those_of_the_solve(tracker_sd):
     result = jaxcal.calibrate(recording, "joint", "gaussian", **given)
     assert float(result.cost) == pytest.approx(sum_of_squares(result, **given), rel=1e-9)
     alone = jax.tree.map(influences._first, result.numpy())
-    whitened = influences._whitened(alone)
+    whitened = influences.whitened_errors(alone)
     information = np.einsum("mkp,mkq->pq", whitened.rows, whitened.rows)
     size = np.sqrt(np.diagonal(information))
     stated = np.asarray(result.information)
@@ -276,7 +276,7 @@ def test_predicting_an_image_from_the_others_is_what_bayes_says():
     step = np.linalg.lstsq(rows.reshape(-1, 4), -errors.reshape(-1), rcond=None)[0]
     seen = influences._Errors(errors + rows @ step, rows, np.arange(3), np.zeros(9),
                               np.ones(9, bool), 9)  # fmt: skip
-    found = influences._influence(seen, np.einsum("mkp,mkq->pq", rows, rows))
+    found = influences._influence(seen, np.zeros(4), np.zeros(4))
     for image in range(9):
         others = np.arange(9) != image
         expected = evidence(rows, errors) - evidence(rows[others], errors[others])
@@ -312,7 +312,7 @@ def test_residuals_that_keep_to_the_model_do_not_contradict_it():
             step = np.linalg.solve(whole, np.einsum("mkp,mk->p", loud, size * errors))
             seen = influences._Errors(size * errors - loud @ step, loud, np.arange(3),
                                       np.zeros(40), np.ones(40, bool), 40)  # fmt: skip
-            ratio, chance = excess(influences._influence(seen, whole), weight)
+            ratio, chance = excess(influences._influence(seen, np.zeros(5), np.zeros(5)), weight)
             out.append(ratio)
             if factor == 1.0:
                 chances.append(chance)
@@ -320,6 +320,26 @@ def test_residuals_that_keep_to_the_model_do_not_contradict_it():
     assert np.std(ratios) == pytest.approx(np.mean(chances), rel=0.25)
     assert np.mean(np.array(ratios) > 1 + 3 * np.array(chances)) < 0.03
     assert np.mean(wild) > 2
+
+
+def test_a_prior_holds_an_answer_as_images_do():
+    """At the minimum with the prior nothing is left to move, and residuals agree with the model."""
+    rng = np.random.default_rng(5)
+    rows = rng.normal(size=(40, 3, 5)) * [1.0, 1.0, 1.0, 1.0, 0.1]
+    precision, weight = np.array([0.0, 0.0, 0.0, 0.0, 2.0]), np.diag([1.0, 1.0, 1.0, 1.0, 0.5])
+    whole = np.einsum("mkp,mkq->pq", rows, rows) + np.diag(precision)
+    ratios = []
+    for _ in range(200):
+        believed = rng.normal(size=5) * [0.0, 0.0, 0.0, 0.0, 2.0**-0.5]
+        errors = rng.normal(size=(40, 3)) - rows @ believed
+        away = -np.linalg.solve(whole, np.einsum("mkp,mk->p", rows, errors))
+        seen = influences._Errors(errors + rows @ away, rows, np.arange(3), np.zeros(40),
+                                  np.ones(40, bool), 40)  # fmt: skip
+        found = influences._influence(seen, precision, away)
+        ratios.append(excess(found, weight)[0])
+    assert np.mean(ratios) == pytest.approx(1.0, abs=0.05)
+    again = influences._influence(seen, precision, away, at_minimum=False)
+    np.testing.assert_allclose(again.moved, found.moved, atol=1e-12)
 
 
 def test_images_in_the_image(result):

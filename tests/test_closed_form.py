@@ -493,3 +493,11 @@ def test_the_record_tells_what_is_proved(crosswire):
     assert certificate_record(joint.numpy(), crosswire)["certified"] is True
     with_delay = dataclasses.replace(joint, blocks=(*joint.blocks, "delay"))
     assert certificate_record(with_delay.numpy(), crosswire) == {"certified": None, "gap_mm2": None}
+
+
+def test_an_answer_at_another_sound_speed_is_proved_without_a_probe():
+    images = drawn(3, 20)
+    images = dataclasses.replace(images, measurements=images.measurements * [1.0, 0.95])
+    recording = jaxcal.Recording(images)
+    result = jaxcal.calibrate(recording, "conventional", estimate="sound-speed")
+    assert certificate_record(result.numpy(), recording)["certified"] is True

@@ -8,6 +8,7 @@ from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -21,9 +22,16 @@ from jaxcal.calibration.dependence import (
     independent,
     same_pose,
 )
-from jaxcal.calibration.serial_correlation import CHANCE, believed_correlation
+from jaxcal.calibration.resampling import relative_twist
+from jaxcal.calibration.serial_correlation import (
+    CHANCE,
+    _covariances,
+    believed_correlation,
+    widened,
+)
 from jaxcal.data.problem import Channels
 from jaxcal.data.recording import make_images
+from jaxcal.diagnostics.influence import influence_of, whitened_errors
 from jaxcal.report.accuracy import GOOD_MM
 from jaxcal.report.record import calibration_record
 
@@ -231,6 +239,78 @@ def test_correlated_errors_widen_the_covariance(frames):
         lines = wide[k].linearisation
         inverse = np.linalg.inv(np.asarray(lines.information))
         np.testing.assert_allclose(np.sqrt(np.diag(inverse)[:6] * lines.variance), wider, rtol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def correlated(frames):
+    """A calibration whose errors are alike in successive images, and the one without that."""
+    made = frames.swept(120, 2.0, np.random.default_rng([11, 3]))
+    problem = jaxcal.Problem.from_arrays(made.poses[::30], made.points[::30])
+    wide = jaxcal.calibrate(problem, "conventional", estimate="sound-speed")
+    assert not wide.notes
+    rows = whitened_errors(jax.tree.map(lambda leaf: np.asarray(leaf)[None], wide)).rows
+    plain = np.linalg.inv(np.einsum("mkp,mkq->pq", rows, rows))
+    assert np.trace(wide.covariance) > 1.2 * np.trace(plain[:6, :6])
+    return wide, plain
+
+
+def test_leaving_an_image_out_is_foretold_where_errors_are_alike(correlated):
+    wide, plain = correlated
+    found = influence_of(wide)
+    np.testing.assert_allclose(found.model_covariance, plain, rtol=1e-6)
+    sd = np.sqrt(np.diagonal(plain))
+    for image in (3, 17):
+        mask = np.array(wide.problem.mask)
+        mask[image] = 0.0
+        without = jaxcal.calibrate(
+            replace(wide.problem, mask=mask), "conventional", estimate="sound-speed"
+        )
+        twist = relative_twist(*(jnp.asarray(one.image_to_probe) for one in (wide, without)))
+        np.testing.assert_allclose(found.moved[image, :6] / sd[:6], twist / sd[:6], atol=0.03)
+
+
+def test_the_sound_speed_is_as_uncertain_as_its_covariance_says(correlated):
+    speed, sd = correlated[0].sound_speed_m_s, correlated[0].sound_speed_sd_m_s
+    whole = np.asarray(correlated[0].unknowns_covariance)
+    assert float(sd) == pytest.approx(float(speed) * whole[9, 9] ** 0.5, rel=1e-9)
+
+
+def test_alike_errors_count_the_same_whether_they_are_the_trackers_or_not(correlated):
+    """A tracker's error moves the target along all axes, as errors of the measurements do."""
+    tau, sigma = 0.8, np.array([0.1, 0.2, 0.6])
+    whole = np.hypot(sigma, tau)
+    joint = replace(correlated[0], prior="gaussian", sigma=whole)
+    within = np.asarray(joint.elevation) * (sigma[2] / whole[2]) ** 2
+    lines = replace(joint.linearisation, tracker_sd=np.asarray(tau))
+    tracked = replace(joint, sigma=sigma, elevation=within, linearisation=lines)
+    expected, found = (
+        np.diagonal(widened(one).unknowns_covariance) / np.diagonal(one.unknowns_covariance)
+        for one in (joint, tracked)
+    )
+    assert expected.max() > 1.2
+    np.testing.assert_allclose(found, expected, rtol=0.02)
+
+
+def test_alike_errors_leave_a_prior_as_it_is():
+    rng = np.random.default_rng(2)
+    rows = np.concatenate([rng.normal(size=(40, 3, 4)), np.zeros((40, 3, 1))], axis=2)
+    # The last two unknowns are told by their sum alone, and one of them by its prior.
+    rows[..., 4] = rows[..., 3]
+    rows[1:] = 0.9 * rows[:-1].cumsum(axis=0) / np.arange(1, 40)[:, None, None] + 0.1 * rows[1:]
+    slow = np.cumsum(rng.normal(size=(40, 3)), axis=0)
+    before, after = _covariances(slow, rows, np.array([0.0, 0.0, 0.0, 0.0, 1e-4]))
+    assert before[4, 4] == pytest.approx(1e4)
+    assert after[4, 4] == pytest.approx(1e4)
+    assert after[0, 0] > 1.5 * before[0, 0]
+
+
+def test_another_sound_speed_costs_no_images_where_it_is_estimated(frames):
+    made = frames.swept(120, 0.05, np.random.default_rng([5, 0]))
+    poses, points = made.poses[::10], made.points[::10] * [1.0, 0.97]
+    for face in (0.0, 5.0):
+        images = make_images(poses, points - [0.0, face], face_offset_mm=face)
+        assert independent(images)[1].stride > 1
+        assert independent(images, ("sound-speed",))[1].stride == 1
 
 
 def test_negligible_errors_cost_no_images_however_slowly_they_change():

@@ -64,6 +64,37 @@ def test_images_masked_by_the_caller_stay_out(consensus):
     np.testing.assert_array_equal(found.keep, mask * (1 - np.asarray(outlier)))
 
 
+def test_exact_images_agree_at_another_sound_speed():
+    exact = problem(3, images=12, noise_mm=0.0, elevation_mm=0.0)
+    # The range of a point is 5 mm more than is measured.
+    points = exact.measurements * jnp.array([1.0, 0.92]) - jnp.array([0.0, 5.0])
+    slow = replace(exact, measurements=points, face_offset=jnp.array(5.0))
+    model = rigid_model((*RIGID, "sound-speed"))
+
+    @jax.jit
+    def proposed(data):
+        every = model.propose(data, jnp.ones((1, 12)))
+        first = jax.tree.map(lambda leaf: leaf[0], every)
+        return first.sound_speed, model.errors(first, data)
+
+    speed, errors = proposed(slow)
+    assert float(speed) == pytest.approx(1 / 0.92, rel=1e-6)
+    np.testing.assert_allclose(errors, 0.0, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_an_unknown_sound_speed_does_not_hide_outliers():
+    clean = problem(3, images=40)
+    wrong = np.arange(40) % 8 == 3
+    points = clean.measurements * jnp.array([1.0, 0.92]) - jnp.array([0.0, 5.0])
+    points = points.at[wrong, 1].add(12.0)
+    spoilt = replace(clean, measurements=points, face_offset=jnp.array(5.0))
+    model = rigid_model((*RIGID, "sound-speed"))
+    found = jax.jit(lambda data: find_consensus(data, model))(spoilt)
+    np.testing.assert_array_equal(found.keep, ~wrong)
+    assert float(found.parameters.sound_speed) == pytest.approx(1 / 0.92, rel=0.01)
+
+
 @pytest.mark.slow
 def test_few_or_hopeless_images_are_all_kept(consensus):
     _, spoilt, _ = batch(0.2, "mixed", 2)

@@ -144,8 +144,8 @@ def independent(data: Any, estimate: tuple[str, ...] = ()) -> tuple[Any, Indepen
 
     Args:
         data: one problem with concrete values, or one set of images with points.
-        estimate: what the calibration will estimate; with ``scale`` or an unknown pixel size, the
-            fits in this module estimate the scale, too.
+        estimate: what the calibration will estimate; the fits in this module estimate the pixel
+            size or the sound speed where it does, and a pixel size that is not known.
 
     Returns:
         The data, and which images are independent. The data have the same shape: one image of every
@@ -448,7 +448,9 @@ def conventional_errors(
     Returns:
         The errors of the conventional fit in closed form; None where there is no such fit.
     """
-    free = ("scale",) if "scale" in estimate or not knows_spacing(data) else ()
+    free = tuple(name for name in ("scale", "sound-speed") if name in estimate)
+    if not knows_spacing(data):
+        free = ("scale",)
     try:
         found = solve_problem(data, free)
     except InputError:
@@ -464,6 +466,6 @@ def _errors(found: ClosedForm, data: Any) -> Float[np.ndarray, "m 3"]:
     if found.scale_mm_per_px is not None:
         points = points * found.scale_mm_per_px
     face = float(getattr(data, "face_offset_mm", getattr(data, "face_offset", 0.0)))
-    transform = found.image_to_probe
-    q = targets_in_images(poses, transform, found.point_mm)
-    return np.stack([q[:, 0] - points[:, 0], q[:, 2] - points[:, 1] - face, q[:, 1]], axis=1)
+    distance = float(found.sound_speed_factor) * (points[:, 1] + face)
+    q = targets_in_images(poses, found.image_to_probe, found.point_mm)
+    return np.stack([q[:, 0] - points[:, 0], q[:, 2] - distance, q[:, 1]], axis=1)

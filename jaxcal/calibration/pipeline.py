@@ -16,7 +16,13 @@ from jaxtyping import Array, Float
 from jaxcal.calibration.answer import Average, Solved, assemble
 from jaxcal.data.problem import Problem
 from jaxcal.model.batch import ImagePlanes, barrier
-from jaxcal.model.observations import BoundedOffsets, LocalUnknown, local_unknowns
+from jaxcal.model.observations import (
+    BoundedOffsets,
+    InPlane,
+    LocalUnknown,
+    Points,
+    local_unknowns,
+)
 from jaxcal.model.unknowns import Blocks
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.jax_modes import in_standard_promotion
@@ -121,6 +127,9 @@ def _normal_matrices(
     """The weighted normal matrix at a solution, and that of the unweighted components."""
     observation, iterate = found.observation, found.iterate
     geometry = observation.geometry(images)
+    if isinstance(observation, Points) and "delay" in iterate.blocks:
+        # Of points a delay only shifts X; what offsets tell it apart by is far below their errors.
+        geometry = InPlane.of(images)
     if geometry is observation and observation.whitened:
         return information_and_design(iterate, observation, images, found.medium)
     weighted = accumulate(iterate, observation, images, None, found.medium).stacked()

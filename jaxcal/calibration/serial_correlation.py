@@ -13,7 +13,7 @@ Each rho_k is the correlation of successive residuals, corrected for leverage. W
 SDs, it is multiplied by 1 - (``CHANCE`` / z)^2, and is zero where z is below ``CHANCE``; for
 independent errors z exceeds ``CHANCE`` in 2 % of recordings, for each kind of error. So independent
 data keep their covariance, and the correction grows continuously. It never makes an answer more
-certain.
+certain. The information P of priors on sound speed and delay is added to both sums.
 
 References: White 1980; Newey and West 1987 (covariances under dependent errors). Here one
 parameter for each kind of error describes the correlation at all lags.
@@ -26,13 +26,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxcal.diagnostics.image_errors import ImageErrors, Whitened
+from jaxcal.diagnostics.image_errors import medium_prior
+from jaxcal.diagnostics.influence import whitened_errors
+from jaxcal.model.unknowns import block_slice
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.arrays import like, map_arrays
-from jaxcal.solvers.plan import TUNED
 
 if TYPE_CHECKING:
-    from jaxcal.result.calibration import Calibration
+    from jaxcal.result.calibration import Calibration, Medium
 
 CHANCE = 2.1
 """SDs that the correlation of successive residuals must exceed to be believed."""
@@ -61,8 +62,9 @@ def widened(result: Calibration) -> Calibration:
     used = int(np.sum(np.asarray(result.mask) > 0))
     if not np.isfinite(covariance).all() or used < FEWEST_SUCCESSIVE:
         return result
-    errors, rows = _whitened(result)
-    found = _covariances(errors, rows)
+    answer = map_arrays(lambda leaf: np.asarray(leaf)[None], result)
+    whitened = whitened_errors(answer)
+    found = _covariances(whitened.errors, whitened.rows, medium_prior(answer)[0])
     if found is None:
         return result
     before, after = found
@@ -74,42 +76,42 @@ def widened(result: Calibration) -> Calibration:
     return replace(
         result,
         unknowns_covariance=like(result.unknowns_covariance, wider),
+        medium=_wider_medium(result, covariance, wider),
         linearisation=replace(
             linearisation, information=like(linearisation.information, information)
         ),
     )
 
 
-def _whitened(result: Calibration) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3 p"]]:
-    """Errors of the used images and their derivatives by the unknowns, in SDs."""
-    answer = map_arrays(lambda leaf: np.asarray(leaf)[None], result)
-    seen = ImageErrors.of_answer(answer)
-    if answer.prior in TUNED:
-        whitened = Whitened.of(answer, seen.shifted(answer))
-        errors, rows = whitened.errors, whitened.rows
-    else:
-        in_plane = np.zeros_like(seen.mask)
-        errors, axial = seen.from_circle(in_plane)
-        rows = seen.circle_rows(axial)
-        sd = np.sqrt(answer.linearisation.variance)[:, None, None]
-        order = [0, 2, 1]
-        errors, rows = (errors / sd)[..., order], (rows / sd[..., None])[:, :, order]
-    used = np.asarray(answer.mask)[0] > 0
-    return errors[0, used], rows[0, used]
+def _wider_medium(
+    result: Calibration, covariance: Float[np.ndarray, "p p"], wider: Float[np.ndarray, "p p"]
+) -> Medium | None:
+    """Sound speed and delay with the SDs of the wider covariance."""
+    medium, changed = result.medium, {}
+    for name, field in (("sound-speed", "sound_speed_sd_m_s"), ("delay", "delay_sd_s")):
+        if name in result.blocks:
+            at = block_slice(result.blocks, name).start
+            sd = getattr(medium, field)
+            by = np.sqrt(wider[at, at] / covariance[at, at])
+            changed[field] = like(sd, np.asarray(sd * by))
+    return medium if medium is None else replace(medium, **changed)
 
 
 def _covariances(
-    errors: Float[np.ndarray, "m 3"], rows: Float[np.ndarray, "m 3 p"]
+    errors: Float[np.ndarray, "m 3"],
+    rows: Float[np.ndarray, "m 3 p"],
+    precision: Float[np.ndarray, " p"],
 ) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "p p"]] | None:
     """Covariances of the unknowns without and with the correlation; None where there is none."""
     count = len(errors)
     each = np.einsum("mkp,mkq->kpq", rows, rows)
-    before = np.linalg.inv(each.sum(axis=0))
+    prior = np.diag(precision)
+    before = np.linalg.inv(each.sum(axis=0) + prior)
     leverage = np.einsum("mkp,pq,mkq->mk", rows, before, rows)
     rho = believed_correlation(errors / np.sqrt(np.maximum(1 - leverage, 0.05)))
     if not rho.any():
         return None
-    middle = np.zeros_like(before)
+    middle = prior
     for k in range(3):
         filtered = rows[:, k].copy()
         for index in range(1, count):
@@ -118,7 +120,7 @@ def _covariances(
         both = half + half.T - each[k]
         # The fit absorbs slow errors more than quick ones, so the SD is too small: enlarge it.
         left = count - np.sum(before * each[k])
-        middle += both * left / max(count - np.sum(before * both), 0.2 * count)
+        middle = middle + both * left / max(count - np.sum(before * both), 0.2 * count)
     lower = np.linalg.cholesky(before)
     inner = np.linalg.solve(lower, before @ middle @ before)
     values, vectors = np.linalg.eigh(np.linalg.solve(lower, inner.T))

@@ -22,9 +22,11 @@ from jaxcal.model import unknowns as model
 from jaxcal.model.unknowns import (
     RIGID_UNKNOWNS,
     TINY,
+    block_slice,
     count_unknowns,
     further_derivatives,
     split_further,
+    step_between,
 )
 from jaxcal.runtime.array_types import AnyArray, Float
 from jaxcal.runtime.arrays import array_module
@@ -271,6 +273,30 @@ def error_sd(answer: Calibration) -> Float[AnyArray, "*batch 3"]:
     if tracker is None:
         return answer.sigma
     return array_module(answer.sigma).hypot(answer.sigma, tracker[..., None])
+
+
+def medium_prior(answer: Calibration) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
+    """Precisions of the priors on sound speed and delay, and how far the answer is from nominal.
+
+    Both are in the order of one calibration's unknowns, in log units and mm; 0 for the others.
+
+    Args:
+        answer: one calibration, which holds its problem, with one leading axis.
+    """
+    precision, away = np.zeros((2, count_unknowns(answer.blocks)))
+    if answer.problem is None or answer.medium is None:
+        return precision, away
+    speed = float(np.asarray(answer.problem.nominal_sound_speed)[0])
+    further = Unknowns.of(answer).further
+    for name, prior, unit in (
+        ("sound-speed", answer.sound_speed_prior_m_s, speed),
+        ("delay", answer.delay_prior_s, 1 / (1e3 * speed)),
+    ):
+        if prior is not None:
+            at, row = block_slice(answer.blocks, name).start, model.TABLE[name]
+            precision[at] = (unit / float(np.asarray(prior)[0])) ** 2
+            away[at] = step_between(name, row.nominal, further[name][0][0], np.log)
+    return precision, away
 
 
 def noise_covariance(answer: Calibration, problem: Problem) -> Float[AnyArray, "*batch n 3 3"]:

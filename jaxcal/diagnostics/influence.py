@@ -10,10 +10,13 @@ answer, and whether that is more than expected.
 *Kinds of errors.* S is the sum of the information from lateral position, range and offset:
 S = sum S_k. The covariance S^-1 = sum S^-1 S_k S^-1 then shows how much comes from each kind.
 
-*What the residuals say.* S^-1 (sum R_i'(I - H_i)^-1/2 e_i e_i'(I - H_i)^-1/2 R_i) S^-1 with the
-leverages H_i = R_i S^-1 R_i' has the expectation S^-1 if the model holds, and is a valid covariance
-even if it does not: it is larger where a few images pull, or where errors are large in images that
-matter.
+*What the residuals say.* S^-1 (sum R_i'(I - H_i)^-1/2 e_i e_i'(I - H_i)^-1/2 R_i + P) S^-1 with
+the leverages H_i = R_i S^-1 R_i' and the priors' information P has the expectation S^-1 if the
+model holds, and is a valid covariance even if it does not: it is larger where a few images pull, or
+where errors are large in images that matter.
+
+All this is of the errors one by one: S is the information before errors that are alike in
+successive images reduced it (:mod:`jaxcal.calibration.serial_correlation`).
 
 Fits with equal weights (conventional, bounded) are whitened by their pooled SD; the part of an
 error that depends on an offset free within bounds is projected out.
@@ -33,6 +36,7 @@ from jaxcal.diagnostics.image_errors import (
     ImageErrors,
     Unknowns,
     Whitened,
+    medium_prior,
     own_covariance,
     quadratic,
 )
@@ -116,12 +120,11 @@ def influence_of(calibration: Calibration) -> Influence:
         raise CalibrationError("a batch holds many calibrations: take one of them")
     alone = map_arrays(_first, calibration.numpy())
     with np.errstate(all="ignore"):
-        found = _whitened(alone)
-        information = np.asarray(alone.linearisation.information)
-        information = information / np.asarray(alone.linearisation.variance)[:, None, None]
+        found = whitened_errors(alone)
         averaged = calibration.offset_law is not None and bool(calibration.offset_law.weighed)
         at_minimum = not averaged and calibration.method != "alternating"
-        return _influence(found, information[0], at_minimum=at_minimum)
+        precision, away = medium_prior(alone)
+        return _influence(found, precision, away, at_minimum=at_minimum)
 
 
 def _first(leaf: Any) -> Array:
@@ -131,17 +134,23 @@ def _first(leaf: Any) -> Array:
 
 
 def _influence(
-    found: _Errors, information: Float[Array, "p p"], *, at_minimum: bool = True
+    found: _Errors,
+    precision: Float[Array, " p"],
+    away: Float[Array, " p"],
+    *,
+    at_minimum: bool = True,
 ) -> Influence:
+    """Influence of whitened errors and a prior of this precision, from which the answer is away."""
     rows, errors = found.rows, found.errors
     components = rows.shape[1]
+    each = np.swapaxes(rows, 1, 2) @ rows
+    information = each.sum(axis=0) + np.diag(precision)
     inverse = inverses(information[None], np.finfo(float).eps)[0]
     if not at_minimum:
         # An answer averaged over laws, or an alternation that stopped early, does not minimise
         # these errors: take them at the minimum.
-        gradient = np.einsum("mkp,mk->p", rows, errors)
+        gradient = np.einsum("mkp,mk->p", rows, errors) + precision * away
         errors = errors - np.einsum("mkp,p->mk", rows, inverse @ gradient)
-    each = np.swapaxes(rows, 1, 2) @ rows
     pull = np.einsum("mkp,mk->mp", rows, errors)
     without = inverses(information - each, np.finfo(float).eps)
     moved = np.einsum("mpq,mq->mp", without, pull)
@@ -174,15 +183,15 @@ def _influence(
         moved=everywhere(moved),
         expected=everywhere(without - inverse),
         shares=inverse @ by_kind @ inverse,
-        residual_covariance=steps.T @ steps,
+        residual_covariance=steps.T @ steps + inverse * precision @ inverse,
         residual_rows=everywhere(rows @ inverse),
         model_covariance=inverse,
         log_density=everywhere(density),
     )
 
 
-def _whitened(answer: Calibration) -> _Errors:
-    """Whitened errors of a calibration with one leading axis of length 1."""
+def whitened_errors(answer: Calibration) -> _Errors:
+    """Errors of a calibration with one leading axis of length 1, in SDs and uncorrelated."""
     seen = ImageErrors.of_answer(answer)
     used = np.asarray(answer.mask)[0] > 0
     if answer.data == "channels":
@@ -301,8 +310,8 @@ def conventional_fit(
     left = max(plain.errors.size - plain.rows.shape[2], 1)
     sd = float(np.sqrt(np.sum(plain.errors**2) / left))
     scaled = _equal_weights(seen, zero, sd, used)
-    rows = scaled.rows.reshape(-1, scaled.rows.shape[2])
-    found = _influence(scaled, rows.T @ rows)
+    none = np.zeros(scaled.rows.shape[2])
+    found = _influence(scaled, none, none)
     kind = scaled.kind
     steps, noise = found.residual_rows[used] / sd, noise[used][:, kind[:, None], kind]
     covariance = np.einsum("nkp,nkl,nlq->pq", steps, noise, steps)

@@ -10,6 +10,7 @@ import numpy as np
 from jaxcal import InputError
 from jaxcal.calibration.dependence import independent
 from jaxcal.data.recording import Images, Recording
+from jaxcal.data.sound import WATER_M_S
 from jaxcal.model.unknowns import FURTHER
 from jaxcal.result.calibration import Calibration
 from jaxcal.solvers.closed_form.calibrate import calibrate_closed_form
@@ -46,8 +47,10 @@ def _of_answer(
     result: Calibration, images: Images, recording: Recording, estimate: tuple[str, ...]
 ) -> Certificate:
     factor, scale = 1.0, result.scale_mm_per_px
-    if result.sound_speed_m_s is not None and recording.probe is not None:
-        factor = float(result.sound_speed_m_s) / recording.probe.sound_speed_m_s
+    if result.sound_speed_m_s is not None:
+        probe = recording.probe
+        nominal = WATER_M_S if probe is None else probe.sound_speed_m_s
+        factor = float(result.sound_speed_m_s) / nominal
     return certify(
         images,
         np.asarray(result.image_to_probe, dtype=float),

@@ -103,11 +103,9 @@ class Consensus(eqx.Module):
 
 
 def rigid_model(blocks: Blocks) -> ConsensusModel:
-    """The calibration's own model: X and the target (and pixel scales where they are free)."""
-    kept = tuple(name for name in blocks if name in ("translation", "rotation", "point", "scale"))
-    return ConsensusModel(
-        kept, depth_scaled_errors, partial(linear_proposals, scaled="scale" in kept)
-    )
+    """The calibration's own model; a delay only shifts X."""
+    kept = tuple(name for name in blocks if name != "delay")
+    return ConsensusModel(kept, depth_scaled_errors, partial(linear_proposals, blocks=kept))
 
 
 def depth_scaled_errors(parameters: Parameters, problem: Problem) -> Float[Array, "n 3"]:

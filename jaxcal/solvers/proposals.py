@@ -6,6 +6,8 @@ image's moments are formed once, and a subset's system is the sum of its images'
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +17,7 @@ from jaxcal.data.geometry import orthonormal_pair
 from jaxcal.data.problem import Problem
 from jaxcal.model.parameters import Parameters
 from jaxcal.model.residuals import measured_points
+from jaxcal.model.unknowns import Blocks
 from jaxcal.solvers import dense
 
 MOST_PROPOSALS, FEWEST_PROPOSALS = 512, 256
@@ -47,13 +50,15 @@ def subset_weights(used: Float[Array, " n"], size: int) -> Float[Array, "k n"]:
     return chosen * used
 
 
-def linear_proposals(problem: Problem, subsets: Float[Array, "k n"], *, scaled: bool) -> Parameters:
+def linear_proposals(
+    problem: Problem, subsets: Float[Array, "k n"], *, blocks: Blocks
+) -> Parameters:
     """Solve the start's linear system (see :mod:`jaxcal.solvers.start`) for every subset at once.
 
     Args:
         problem: one problem.
         subsets: (k, n) weights.
-        scaled: the pixel scales are unknown and found as well.
+        blocks: the unknowns; pixel scales or a sound speed among them are found as well.
 
     Returns:
         Parameters with a leading axis k.
@@ -92,16 +97,24 @@ def linear_proposals(problem: Problem, subsets: Float[Array, "k n"], *, scaled: 
         first, third = columns[:3], columns[3:]
         sizes = jnp.stack([jnp.sqrt(jnp.sum(first**2)), jnp.sqrt(jnp.sum(third**2))])
         lateral, axial = orthonormal_pair(first / sizes[0], third / sizes[1])
-        scale = sizes if scaled else jnp.ones_like(sizes)
+        scale, speed = jnp.ones_like(sizes), jnp.ones_like(sizes[0])
+        if "scale" in blocks:
+            scale = sizes
+        if "sound-speed" in blocks:
+            speed = sizes[1]
+            scale = scale.at[1].set(speed)
         known = jnp.concatenate([scale[0] * lateral, scale[1] * axial])
         rest = dense.solve_positive(
             matrix[6:, 6:], (system[6:12, 12] - system[6:12, :6] @ known)[:, None]
         )[:, 0]
-        # Pixel row 0 need not be at the transducer's face: the range of row 0 is not scaled.
-        depth = scale[1] * (mean[1] - problem.face_offset) + problem.face_offset
+        # Pixel row 0 need not be at the transducer's face: a pixel's size does not scale the range
+        # of row 0, the sound speed does.
+        face = speed * problem.face_offset
+        depth = scale[1] * (mean[1] - problem.face_offset) + face
         translation = length * rest[:3] - scale[0] * mean[0] * lateral - depth * axial
         rotation = jnp.stack([lateral, jnp.cross(axial, lateral), axial], axis=1)
-        return Parameters.of(rotation, translation, length * rest[3:] + centre, scale)
+        point, pixel = length * rest[3:] + centre, scale.at[1].divide(speed)
+        return replace(Parameters.of(rotation, translation, point, pixel), sound_speed=speed)
 
     return jax.vmap(solve)(systems)
 
