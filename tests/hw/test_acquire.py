@@ -22,10 +22,12 @@ import pytest
 pytest.importorskip("rtde_control", reason="ur_rtde is not installed (jaxcal[robot])")
 pytest.importorskip("serial", reason="pyserial is not installed (jaxcal[serial])")
 
+from motions import LIMITS, OFFSET, SERIAL, beside
 from test_recorder import wait_until_closed
 
 import jaxcal
 from hw.acquisition.acquire import AcquisitionStopped, Outcome, acquire
+from hw.acquisition.job import plan_to_go
 from hw.acquisition.outcome import lines_of, share_inside
 from hw.acquisition.request import AcquisitionRequest, request_in
 from hw.bench.run import Bench
@@ -35,6 +37,7 @@ from hw.recording.resuming import check_same_robot
 from hw.recording.session import Watch
 from hw.robot.confirmation import confirm_unattended
 from hw.robot.motion_plan import MotionPlan
+from hw.robot.path_checks import check_plan
 from hw.runtime.errors import RefusedError
 from hw.runtime.keys import Pause
 from hw.setup.check import check
@@ -523,6 +526,23 @@ def test_a_resumed_run_needs_the_same_robot():
         check_same_robot(before, "a", [*offset[:2], 0.121, *offset[3:]])
     with pytest.raises(RefusedError, match="does not say"):
         check_same_robot({"serial_number": "a", "tcp_offset": [0.0]}, "a", offset)
+
+
+def test_a_resumed_plan_holds_the_poses_that_the_way_leads_through():
+    """Where the way to a pose without an image is too long, or turns too far, for one motion."""
+    poses = [beside(x, 0.0, 0.0) for x in (0.0, 40.0, 80.0, 110.0)]
+    whole = MotionPlan(np.array(poses), replace(LIMITS, box_max_mm=(600.0, -30.0, 320.0)),
+                       OFFSET, SERIAL)  # fmt: skip
+    check_plan(whole)
+    for missing, here, rows in [
+        ([0, 1, 2, 3], poses[0], [0, 1, 2, 3]),
+        ([2, 3], poses[1], [2, 3]),
+        ([2, 3], poses[0], [0, 1, 2, 3]),
+        ([0, 3], poses[0], [0, 1, 2, 3]),
+        ([], poses[0], [0, 1, 2, 3]),
+    ]:
+        plan = plan_to_go(whole, missing, here)
+        np.testing.assert_array_equal(plan.targets, whole.targets[rows])
 
 
 @pytest.mark.parametrize(
