@@ -27,15 +27,17 @@ from test_recorder import wait_until_closed
 
 import jaxcal
 from hw.acquisition.acquire import AcquisitionStopped, Outcome, acquire
-from hw.acquisition.job import plan_to_go
+from hw.acquisition.job import motion_plan, open_recorder, plan_to_go, prepare
 from hw.acquisition.outcome import lines_of, share_inside
 from hw.acquisition.request import AcquisitionRequest, request_in
+from hw.acquisition.stage import ProbeStage
 from hw.bench.run import Bench
-from hw.midplane.search import Settings
+from hw.midplane.search import PlacementError, Settings
 from hw.planning.poses import Extent
 from hw.recording.resuming import check_same_robot
-from hw.recording.session import Watch
+from hw.recording.session import Session, Watch
 from hw.robot.confirmation import confirm_unattended
+from hw.robot.motion import Motion
 from hw.robot.motion_plan import MotionPlan
 from hw.robot.path_checks import check_plan
 from hw.runtime.errors import RefusedError
@@ -394,6 +396,32 @@ def test_a_robot_that_may_not_move_is_named_and_the_run_is_resumed(e_series, tmp
     check_recording(path, bench, 4)
     assert main(["calibrate", str(path), "--method", "conventional", "--json"]) in (0, 3, 5)
     assert '"truth_error"' in capsys.readouterr().out
+
+
+def test_a_search_that_the_limits_do_not_allow_gives_the_pose_up(e_series, tmp_path):
+    """The run ended at that pose, and again whenever it was resumed."""
+    setup = setup_of(e_series)
+    setup = replace(setup, limits={**setup.limits, "search_mm": 0.1})
+    job = prepare(setup, tmp_path / "rec.h5", AcquisitionRequest(4, "amplitude-scan", 1, bench=3))
+    with (
+        open_recorder(tmp_path / "rec.h5", job) as recorder,
+        Session(setup, recorder) as session,
+    ):
+        here = session.poses.latest().pose[None]
+        plan = replace(motion_plan(job, session), targets=here)
+        agreed = confirm_unattended(plan, plan.digest, clock=setup.clock)
+        with Motion(
+            setup.robot_host, plan, agreed, clock=setup.clock, dry_run=False, caller_s=2.0
+        ) as motion:
+            stage = ProbeStage(session, motion, here, lambda kind, text: None)
+            stage.go_to(0)
+            for offset in (0.5, 0.05, -0.5):
+                if abs(offset) < 0.1:
+                    assert stage.move(offset) == pytest.approx(offset, abs=0.2)
+                    continue
+                with pytest.raises(PlacementError, match=r"may not go .0\.5 mm .*within 0\.1 mm"):
+                    stage.move(offset)
+            assert not motion.ended
 
 
 def check_recording(path: Path, bench: Bench, images: int) -> None:
