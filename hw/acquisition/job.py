@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shlex
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
@@ -18,9 +18,11 @@ from hw.recording.resuming import check_same_robot, compare, described, describe
 from hw.recording.session import Session
 from hw.robot.identity import LOCAL
 from hw.robot.motion_plan import MotionPlan
-from hw.runtime.errors import refused
+from hw.robot.path_checks import check_path, check_plan
+from hw.runtime.errors import RefusedError, refused
 from hw.setup.description import Setup, controller_arm
 from jaxcal.io.given_files import naming
+from jaxcal.runtime.array_types import Float
 
 
 @dataclass(frozen=True)
@@ -117,10 +119,33 @@ def motion_plan(job: Job, session: Session) -> MotionPlan:
     if pendant is None:
         raise refused("the controller does not report its speed slider")
     limits = job.setup.motion_limits(controller_arm(identity.model, identity.version))
-    joints = session.poses.latest().joints
-    # Where every image was taken, only the end of the file is missing: any plan will do.
-    to_go = job.targets[job.missing or slice(None)]
-    return MotionPlan(to_go, limits, offset, identity.name, joints, pendant)
+    here = session.poses.latest()
+    whole = MotionPlan(job.targets, limits, offset, identity.name, here.joints, pendant)
+    # The order in which poses of a pool are visited is not known yet.
+    return plan_to_go(whole, job.missing, here.pose) if job.request.plan == "sobol" else whole
+
+
+def plan_to_go(whole: MotionPlan, missing: list[int], here: Float[np.ndarray, "4 4"]) -> MotionPlan:
+    """Only the poses without an image, if each can be reached directly from the one before.
+
+    Otherwise all poses: the way leads through those that have an image
+    (:meth:`hw.acquisition.stage.ProbeStage.go_to`).
+
+    Args:
+        whole: plan of all poses.
+        missing: rows without an image, in order; where there are none, only the end of the file is
+            missing, and any plan will do.
+        here: (4, 4) mm, where the robot is.
+    """
+    if not missing:
+        return whole
+    direct = replace(whole, targets=whole.targets[missing])
+    try:
+        check_path(direct, here, direct.targets[0], "the way to the first pose")
+        check_plan(direct)
+    except RefusedError:
+        return whole
+    return direct
 
 
 def record_confirmed(job: Job, plan: MotionPlan, session: Session, recorder: Recorder) -> None:

@@ -86,11 +86,24 @@ class ProbeStage:
             self._move(self._targets[passing], None)
 
     def move(self, offset_mm: float) -> float:
-        """Go to an offset (mm) along the elevational axis; the offset as tracked."""
+        """Go to an offset (mm) along the elevational axis; the offset as tracked.
+
+        Raises:
+            PlacementError: the limits, or the controller, do not allow it; nothing moved.
+            DeviceError: stopped, lost, or a device in lasting trouble.
+        """
         pose = self.plan_pose.copy()
         direction = pose[:3, :3] @ self._axis
         pose[:3, 3] += offset_mm * direction
-        tracked = self._move(pose, None).pose
+        try:
+            tracked = self._move(pose, None).pose
+        except RefusedError as error:
+            if self._motion.ended:  # refused while it moved, for good
+                raise
+            raise PlacementError(
+                f"the search may not go {offset_mm:+.1f} mm from the planned pose: {error.args[0]}",
+                device="robot",
+            ) from None
         return float((tracked[:3, 3] - self.plan_pose[:3, 3]) @ direction)
 
     def read(self, frames: int) -> Echoes:

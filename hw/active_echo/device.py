@@ -152,6 +152,8 @@ class ActiveEcho:
     def _greet(self) -> None:
         """Silence the device, whatever state it was left in, and ask for its clock frequency."""
         self._ask("STRM", "OFF", expected="OFF")
+        # A program that was killed may have left it answering: every image would show that.
+        self.inject(False)
         self._tick_s = 1.0 / self.clock_hz()
         with self._changed:
             self._frames.clear()

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 from typing import TYPE_CHECKING
 
 import click
+
+from hw.runtime.interrupts import heed_interrupt
 
 if TYPE_CHECKING:
     from hw.acquisition.acquire import Confirm
@@ -32,13 +35,30 @@ def confirming_by(clock: Clock, emulated: bool, unattended: str | None) -> Confi
             f"{challenge.code} to let it move.",
             err=True,
         )
-        try:
-            code = click.prompt("code", err=True)
-        except click.Abort:
-            raise KeyboardInterrupt from None
-        return confirm(challenge, code, clock=clock)
+        return confirm(challenge, _typed_code(), clock=clock)
 
     return ask
+
+
+def _typed_code() -> str:
+    """What the operator types.
+
+    Raises:
+        KeyboardInterrupt: Ctrl-C.
+        RefusedError: standard input is closed, or ends before anything is typed.
+    """
+    from hw.runtime.errors import refused
+
+    if sys.stdin is not None:
+        try:
+            return click.prompt("code", err=True)
+        except click.Abort:
+            # Ctrl-C, or the end of standard input.
+            heed_interrupt()
+    raise refused(
+        "not confirmed: standard input ended before the code was typed; run it at a terminal, or "
+        "name the plan with --unattended DIGEST"
+    )
 
 
 def plan_page(plan: MotionPlan) -> list[str]:

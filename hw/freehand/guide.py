@@ -2,7 +2,8 @@
 
 An image is taken automatically once the probe has been held still for a moment, if it shows a
 credible target and differs from the images before: another orientation, or the target elsewhere in
-the image. Its pose is the mean over that moment. The person is told what is still missing: parts of
+the image (and then the pose, too, must differ: the target rests). Its pose is the mean over that
+moment. The person is told what is still missing: parts of
 the image where the target has not been, and turns of the probe, also about a second axis.
 """
 
@@ -166,6 +167,13 @@ class Guide:
                 "image",
                 pixel=where,
             )
+        for index, other in enumerate(self.taken):
+            if self._still(np.array([other.pose, pose])):
+                return Look(
+                    f"the pose is that of image {index + 1}, but the target is elsewhere in the "
+                    "image: is the tracker frozen, or was the target moved?",
+                    pixel=where,
+                )
         taken = Taken(pose, pixel, located.covariance[0], middle.time, middle)
         return Look(f"taken: {len(self.taken) + 1}", taken, where)
 

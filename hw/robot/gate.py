@@ -179,7 +179,8 @@ class Gate:
             goal,
             velocity,
             acceleration,
-            length / velocity + velocity / acceleration,
+            # The speed slider slows the whole motion down, as it was when the plan was made.
+            (length / velocity + velocity / acceleration) / self.plan.pendant.speed_fraction,
         )
 
     def _check_arm(

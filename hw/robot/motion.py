@@ -9,9 +9,9 @@ A stop is latched on both sides of the pipe: here in :attr:`Motion._stop`, in th
 described in :mod:`hw.robot.mover.control_loop`. There are two kinds of stops.
 
 - A *stop* (:meth:`Motion.stop`, a guard that reports danger or fails, a log that fails, an
-  interrupt such as Ctrl-C, force, the box, a protective stop, a motion that does not arrive) ends
-  motion: :attr:`Motion.ended` is true, every later move is refused, and only a new confirmation
-  lets the robot move again.
+  interrupt such as Ctrl-C, a suspension of this process for more than 10 s, force, the box, a
+  protective stop, a motion that does not arrive) ends motion: :attr:`Motion.ended` is true, every
+  later move is refused, and only a new confirmation lets the robot move again.
 - A *hesitation* (StaleError: poses, echo frames, images or this process were silent for a moment)
   stops the robot in the same way, but the same move may be asked for again. Nothing said that
   moving was dangerous; for a moment the software could not know that it was safe.
@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import queue
 import subprocess
 import sys
@@ -54,6 +55,8 @@ _START_PATIENCE_S = 30.0
 # The controller's watchdog has stopped the robot long before; a busy machine gets time to answer.
 _HANGS_WALL_S = 2.0
 _HELD_UP_WALL_S = 0.5
+_SUSPENDED_WALL_S = 10.0
+"""After a longer suspension somebody may stand at the robot: it must not go on by itself."""
 
 
 class Motion:
@@ -102,6 +105,8 @@ class Motion:
         """The stop asked for, never cleared: no move is sent or reported as arrived after it."""
         self._count = 0
         self._heard = 0.0
+        self._told = math.inf
+        """When the other process told something last; it does so all the time, also at rest."""
         self._in_motion = False
 
     def start(self) -> Motion:
@@ -156,6 +161,7 @@ class Motion:
         self.serial = str(answer["serial"])
         offset = answer["tcp_offset"]
         self.tcp_offset = None if offset is None else tuple(offset)
+        self._told = time.monotonic()
         return self
 
     def __enter__(self) -> Motion:
@@ -328,6 +334,8 @@ class Motion:
         """
         if self._process is None:
             raise refused("motion was not started")
+        if self._process.poll() is None:
+            self._check_suspended()
         over = self._ended or self._stop
         if over is not None:
             raise refused(
@@ -339,6 +347,12 @@ class Motion:
             if error is not None and answer.get("ended"):
                 self._kill(error)
                 raise error
+
+    def _check_suspended(self) -> None:
+        """Stop for good after a long suspension (Ctrl-Z)."""
+        silent = time.monotonic() - self._told
+        if silent > _SUSPENDED_WALL_S + self.clock.wall(0.5):
+            self.stop(f"this program was suspended for {silent:.0f} s")
 
     def _kill(self, error: DeviceError) -> None:
         self._ended = self._ended or error
@@ -370,7 +384,10 @@ class Motion:
         try:
             with self._process.stdout as lines:
                 for line in lines:
+                    self._check_suspended()
                     self._heard = time.monotonic()
+                    if self.serial is not None:
+                        self._told = self._heard
                     self._hear(json.loads(line))
         finally:
             text = "the motion process ended; the robot's own watchdog stops it"

@@ -53,6 +53,10 @@ class MotionPlan:
             object.__setattr__(self, "joints", numbers(self.joints, 6, "joints"))
         if not 1 <= len(self.serial) <= 100:
             raise refused("the plan does not say which robot it is for")
+        if not self.pendant.speed_fraction > 0:
+            raise refused(
+                "the speed slider is at 0 %, so the robot would not move: raise it at the pendant"
+            )
 
     @classmethod
     def from_poses(

@@ -188,15 +188,20 @@ class _Terminal:
     def keys(self) -> None:
         import tty
 
-        tty.setcbreak(self._number)
+        if self._ours():
+            tty.setcbreak(self._number)
 
     def lines(self) -> None:
         termios = _termios()
-        termios.tcsetattr(self._number, termios.TCSADRAIN, self._before)
+        if self._ours():
+            termios.tcsetattr(self._number, termios.TCSADRAIN, self._before)
 
     def typed(self) -> bytes | None:
         """What was typed within a short time; None when the terminal is gone."""
         try:
+            if not _is_foreground(self._number):
+                time.sleep(_PERIOD_S)
+                return b""
             if not self._waiting():
                 return b""
             typed = os.read(self._number, 256)
@@ -206,6 +211,13 @@ class _Terminal:
             return typed or None
         except OSError:
             return None
+
+    def _ours(self) -> bool:
+        """Whether the terminal's modes may be set: a process in the background is suspended."""
+        try:
+            return _is_foreground(self._number)
+        except OSError:  # it is gone
+            return False
 
     def _waiting(self) -> bool:
         return bool(select.select([self._number], [], [], _PERIOD_S)[0])
@@ -238,6 +250,10 @@ def _in_foreground() -> bool:
         return False
     try:
         _termios()
-        return os.tcgetpgrp(sys.stdin.fileno()) == os.getpgrp()
+        return _is_foreground(sys.stdin.fileno())
     except (ImportError, OSError, ValueError):
         return False
+
+
+def _is_foreground(terminal: int) -> bool:
+    return os.tcgetpgrp(terminal) == os.getpgrp()

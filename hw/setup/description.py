@@ -298,6 +298,11 @@ def _robot(table: dict[str, Any]) -> dict[str, Any]:
                 f"[robot] tcp_offset is {np.linalg.norm(offset[:3]):g} m long: is it in mm? It is "
                 "in m and rad, as at the pendant"
             )
+        if np.linalg.norm(offset[3:]) > 2 * np.pi:
+            raise InputError(
+                f"[robot] tcp_offset turns by {np.linalg.norm(offset[3:]):g} rad, more than a full "
+                "turn: is it in degrees? It is in m and rad, as at the pendant"
+            )
         robot["tcp_offset"] = tuple(offset.tolist())
     if "model" in robot:
         robot["model"] = _arm_name(robot["model"])

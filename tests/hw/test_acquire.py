@@ -22,19 +22,24 @@ import pytest
 pytest.importorskip("rtde_control", reason="ur_rtde is not installed (jaxcal[robot])")
 pytest.importorskip("serial", reason="pyserial is not installed (jaxcal[serial])")
 
+from motions import LIMITS, OFFSET, SERIAL, beside
 from test_recorder import wait_until_closed
 
 import jaxcal
 from hw.acquisition.acquire import AcquisitionStopped, Outcome, acquire
+from hw.acquisition.job import motion_plan, open_recorder, plan_to_go, prepare
 from hw.acquisition.outcome import lines_of, share_inside
 from hw.acquisition.request import AcquisitionRequest, request_in
+from hw.acquisition.stage import ProbeStage
 from hw.bench.run import Bench
-from hw.midplane.search import Settings
+from hw.midplane.search import PlacementError, Settings
 from hw.planning.poses import Extent
 from hw.recording.resuming import check_same_robot
-from hw.recording.session import Watch
+from hw.recording.session import Session, Watch
 from hw.robot.confirmation import confirm_unattended
+from hw.robot.motion import Motion
 from hw.robot.motion_plan import MotionPlan
+from hw.robot.path_checks import check_plan
 from hw.runtime.errors import RefusedError
 from hw.runtime.keys import Pause
 from hw.setup.check import check
@@ -393,6 +398,32 @@ def test_a_robot_that_may_not_move_is_named_and_the_run_is_resumed(e_series, tmp
     assert '"truth_error"' in capsys.readouterr().out
 
 
+def test_a_search_that_the_limits_do_not_allow_gives_the_pose_up(e_series, tmp_path):
+    """The run ended at that pose, and again whenever it was resumed."""
+    setup = setup_of(e_series)
+    setup = replace(setup, limits={**setup.limits, "search_mm": 0.1})
+    job = prepare(setup, tmp_path / "rec.h5", AcquisitionRequest(4, "amplitude-scan", 1, bench=3))
+    with (
+        open_recorder(tmp_path / "rec.h5", job) as recorder,
+        Session(setup, recorder) as session,
+    ):
+        here = session.poses.latest().pose[None]
+        plan = replace(motion_plan(job, session), targets=here)
+        agreed = confirm_unattended(plan, plan.digest, clock=setup.clock)
+        with Motion(
+            setup.robot_host, plan, agreed, clock=setup.clock, dry_run=False, caller_s=2.0
+        ) as motion:
+            stage = ProbeStage(session, motion, here, lambda kind, text: None)
+            stage.go_to(0)
+            for offset in (0.5, 0.05, -0.5):
+                if abs(offset) < 0.1:
+                    assert stage.move(offset) == pytest.approx(offset, abs=0.2)
+                    continue
+                with pytest.raises(PlacementError, match=r"may not go .0\.5 mm .*within 0\.1 mm"):
+                    stage.move(offset)
+            assert not motion.ended
+
+
 def check_recording(path: Path, bench: Bench, images: int) -> None:
     """A complete one, with the truth of its bench."""
     recording = jaxcal.load(path)
@@ -523,6 +554,23 @@ def test_a_resumed_run_needs_the_same_robot():
         check_same_robot(before, "a", [*offset[:2], 0.121, *offset[3:]])
     with pytest.raises(RefusedError, match="does not say"):
         check_same_robot({"serial_number": "a", "tcp_offset": [0.0]}, "a", offset)
+
+
+def test_a_resumed_plan_holds_the_poses_that_the_way_leads_through():
+    """Where the way to a pose without an image is too long, or turns too far, for one motion."""
+    poses = [beside(x, 0.0, 0.0) for x in (0.0, 40.0, 80.0, 110.0)]
+    whole = MotionPlan(np.array(poses), replace(LIMITS, box_max_mm=(600.0, -30.0, 320.0)),
+                       OFFSET, SERIAL)  # fmt: skip
+    check_plan(whole)
+    for missing, here, rows in [
+        ([0, 1, 2, 3], poses[0], [0, 1, 2, 3]),
+        ([2, 3], poses[1], [2, 3]),
+        ([2, 3], poses[0], [0, 1, 2, 3]),
+        ([0, 3], poses[0], [0, 1, 2, 3]),
+        ([], poses[0], [0, 1, 2, 3]),
+    ]:
+        plan = plan_to_go(whole, missing, here)
+        np.testing.assert_array_equal(plan.targets, whole.targets[rows])
 
 
 @pytest.mark.parametrize(

@@ -279,12 +279,14 @@ def test_counters_wrap_and_restart() -> None:
 def test_left_streaming(emulator: AuspisEmulator) -> None:
     """As by a program that was killed: the next one finds its way in."""
     transport = open_transport(emulator.path)
-    transport.write(encode_line("THR 9") + encode_line("STRM ON"))
+    transport.write(encode_line("THR 9") + encode_line("PATT:STAT ON") + encode_line("STRM ON"))
     until(lambda: emulator.sent > 20)
     transport.close()
+    assert emulator.injection.on
     # A pty keeps what nobody reads until it is full.
     until(lambda: emulator.refused or emulator.path.startswith("socket"))
     with opened(emulator) as device:
+        assert not emulator.injection.on
         assert device.threshold() == 9
         assert device.statistics() == EchoStatistics()
         device.stream(True)

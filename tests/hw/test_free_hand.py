@@ -437,6 +437,24 @@ def test_an_image_is_taken_however_seldom_images_come(period_s):
     assert taken[0] <= 1.0
 
 
+def test_a_tracker_that_is_frozen_has_no_image_taken():
+    """Its software repeats the last pose with new time stamps, while the image goes on."""
+    rng = np.random.default_rng(0)
+    poses, pixels = holds(3, 1)
+    guide = Guide()
+    words = []
+    for number in range(60):
+        # It freezes at the first pose, and works again at the last.
+        pose = poses[0 if number < 40 else 2]
+        look = guide.look(still(pose, 0.1 * number, frame(rng, pixels[number // 20])))
+        words.append(look.words)
+        if look.taken is not None:
+            guide.keep(look.taken)
+    assert [each.time // 2.0 for each in guide.taken] == [0, 2]
+    frozen = "the pose is that of image 1, but the target is elsewhere in the image: is the tracker"
+    assert any(each.startswith(frozen) for each in words)
+
+
 def test_advice_names_what_is_missing():
     rng = np.random.default_rng(0)
 

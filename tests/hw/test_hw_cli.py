@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import io
 import json
 import re
 import signal
@@ -14,13 +15,15 @@ import pytest
 from test_setup import GOOD
 
 import jaxcal
-from hw.cli.confirming import plan_page
+from hw.cli.confirming import confirming_by, plan_page
 from hw.cli.main import main
 from hw.recording.check import read_progress
 from hw.recording.file import RecordingWriter
 from hw.recording.layout import RecordingHeader
 from hw.robot.limits import Limits
 from hw.robot.motion_plan import MotionPlan
+from hw.runtime.clock import REAL
+from hw.runtime.errors import RefusedError
 
 
 @pytest.mark.parametrize(
@@ -212,20 +215,32 @@ def test_check_says_what_is_wrong_with_each_device(capsys):
     assert "payload 0 kg at [0, 0, 0] m, speed slider at 100 %" in out
 
 
+LIMITS = Limits.from_mapping({
+    "box_min_mm": [0, 0, 0], "box_max_mm": [99, 99, 99], "tip_mm": [0, 0, 50],
+    "cone_axis": [0, 0, 1], "cone_deg": 30, "max_step_mm": 10, "max_turn_deg": 10,
+    "max_speed_mm_s": 10,
+})  # fmt: skip
+
+
+@pytest.mark.parametrize("given", [None, "", "\n\n", "yes\n"])
+def test_nothing_is_confirmed_where_nobody_types_the_code(monkeypatch, given):
+    """Standard input closed, at its end, empty lines, or another answer."""
+    monkeypatch.setattr(sys, "stdin", None if given is None else io.StringIO(given))
+    plan = MotionPlan(np.eye(4)[None], LIMITS, (0.0,) * 6, "20195500042")
+    said = "the code typed is not" if given == "yes\n" else "run it at a terminal, or name the plan"
+    with pytest.raises(RefusedError, match=f"not confirmed: .*{said}"):
+        confirming_by(REAL, False, None)(plan)
+
+
 def test_who_confirms_is_told_of_an_arm_that_nothing_identifies():
-    limits = Limits.from_mapping({
-        "box_min_mm": [0, 0, 0], "box_max_mm": [99, 99, 99], "tip_mm": [0, 0, 50],
-        "cone_axis": [0, 0, -1], "cone_deg": 30, "max_step_mm": 10, "max_turn_deg": 10,
-        "max_speed_mm_s": 10,
-    })  # fmt: skip
     poses = np.eye(4)[None]
-    known = MotionPlan(poses, limits, (0.0,) * 6, "20195500042, calibration 0123456789ab")
+    known = MotionPlan(poses, LIMITS, (0.0,) * 6, "20195500042, calibration 0123456789ab")
     page = "\n".join(plan_page(known))
     assert known.serial in page
     assert known.digest[:16] in page
     assert "speed slider at 100 %" in page
     assert "NOTHING IDENTIFIES" not in page
-    unknown = MotionPlan(poses, limits, (0.0,) * 6, "UR5@192.168.1.10")
+    unknown = MotionPlan(poses, LIMITS, (0.0,) * 6, "UR5@192.168.1.10")
     assert "NOTHING IDENTIFIES THIS ARM" in "\n".join(plan_page(unknown))
 
 

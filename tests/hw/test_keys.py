@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import pytest
 
 pytest.importorskip("pty", reason="there are no pseudo-terminals here")
@@ -71,6 +73,48 @@ def test_a_terminal_by_keys_and_by_lines(tmp_path):
         assert person.finish() != 0
         assert "KeyboardInterrupt" in person.shown
         assert person.modes() == person.modes_before
+
+
+SHELL = """
+import os, signal, subprocess, sys
+signal.signal(signal.SIGTTOU, signal.SIG_IGN)
+job = subprocess.Popen([sys.executable, "-c", sys.argv[1]], process_group=0,
+                       stdout=subprocess.PIPE, text=True,
+                       preexec_fn=lambda: signal.signal(signal.SIGTTOU, signal.SIG_DFL))
+os.tcsetpgrp(0, job.pid)
+print(job.stdout.readline(), end="", flush=True)
+os.kill(job.pid, signal.SIGSTOP)
+os.waitpid(job.pid, os.WUNTRACED)
+os.tcsetpgrp(0, os.getpgrp())
+os.kill(job.pid, signal.SIGCONT)
+print("in the background", flush=True)
+print(f"typed {sys.stdin.readline()}", end="", flush=True)
+_, status = os.waitpid(job.pid, os.WUNTRACED)
+print("suspended" if os.WIFSTOPPED(status) else job.stdout.read(), flush=True)
+"""
+"""What a shell does: a job in the foreground, Ctrl-Z, ``bg``, and the next command is typed."""
+
+JOB = """
+import time
+from hw.runtime.keys import Pause, watch_keys
+pause = Pause()
+with watch_keys(pause, lambda line: None):
+    print("ready", flush=True)
+    time.sleep(1.5)
+    assert not pause.held
+print("ended in order", flush=True)
+"""
+
+
+def test_a_job_in_the_background_leaves_the_terminal_alone(tmp_path):
+    """The system suspends who reads from it, or sets it: a robot would stop for no reason."""
+    with Terminal(["-c", SHELL, JOB], tmp_path) as person:
+        person.wait_for("ready")
+        person.wait_for("in the background")
+        time.sleep(0.2)
+        person.type("ls\r")
+        assert person.finish() == 0
+        assert "ended in order" in person.shown
 
 
 def test_without_a_terminal_nothing_is_read(tmp_path, capsys):

@@ -162,6 +162,24 @@ def test_a_stop_before_the_start_or_at_rest_is_kept():
         assert sent(robot, 3) == []
 
 
+@pytest.mark.parametrize("moving_when", ["at rest", "in motion"])
+def test_a_caller_that_was_suspended_for_long_does_not_go_on_by_itself(monkeypatch, moving_when):
+    """It is really suspended, as by Ctrl-Z: somebody may have come near the robot meanwhile."""
+    monkeypatch.setattr("hw.robot.motion._SUSPENDED_WALL_S", 0.2)
+    script = f"sleep 0.3; kill -STOP {os.getpid()}; sleep 1; kill -CONT {os.getpid()}"
+    with EmulatedRobot() as robot, moving(robot) as motion:
+        with subprocess.Popen(["sh", "-c", script]) as suspending:
+            if moving_when == "at rest":
+                suspending.wait()
+            with pytest.raises((StoppedError, RefusedError), match="program was suspended for"):
+                motion.move_to(PLAN.targets[2])
+        assert motion.ended
+        assert len(sent(robot, 3)) == (moving_when == "in motion")
+        assert robot.state()["velocity"] == [0.0] * 6
+        with pytest.raises(RefusedError, match=r"suspended for .*confirm the plan"):
+            motion.move_to(PLAN.targets[2])
+
+
 def test_a_stop_while_it_connects_is_heard():
     """At once after the setup, so that both may be read together."""
     with EmulatedRobot(version=CB_SERIES) as robot, ThreadPoolExecutor(1) as pool:

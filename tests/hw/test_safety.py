@@ -360,6 +360,20 @@ def test_a_confirmation_is_bound_to_robot_and_what_is_set_at_the_pendant():
         confirmed(valid_s=1e9)
 
 
+def test_a_slow_speed_slider_gives_a_motion_more_time():
+    """The controller slows every motion down by it; a motion that is late is stopped for good."""
+    slow = replace(PLAN, pendant=PendantSettings(speed_fraction=0.25))
+    for target in PLAN.targets:
+        fast, slowed = (
+            gate(plan).check_geometry(target, sample(HOME), None) for plan in (PLAN, slow)
+        )
+        assert slowed.duration_s == pytest.approx(4 * fast.duration_s)
+        assert (slowed.raw, slowed.speed_m_s) == (fast.raw, fast.speed_m_s)
+    for fraction in (0.0, -1.0, math.nan):
+        with pytest.raises(RefusedError, match="speed slider is at 0 %"):
+            replace(PLAN, pendant=PendantSettings(speed_fraction=fraction))
+
+
 def test_a_confirmation_that_expires_ends_no_plan_that_was_begun():
     mine = confirmed()
     for late in (replace(mine, expires_s=CLOCK.now()), replace(mine, issued_s=1e9)):

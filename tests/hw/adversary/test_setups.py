@@ -88,6 +88,7 @@ def test_the_good_setup_passes(tmp_path, capsys):
         ("max_speed_mm_s = 50", f"max_speed_mm_s = {10**99}", "max_speed_mm_s must be"),
         ("[plan]\ncone_deg = 30", f"[plan]\ncone_deg = {10**99}", "cone_deg must be"),
         ("[350, -250, 80]", f"[350, -250, {10**99}]", "it is in mm"),
+        ("tcp_offset = [0, 0, 0.12, 0", "tcp_offset = [0, 0, 0.12, 180", "is it in degrees?"),
         ("tcp_offset = [0, 0", f"tcp_offset = [0, {10**99}", "is it in mm?"),
         ("max_speed_mm_s = 50", "max_speed_mm_s = 1e400", "must be a finite number"),
         # Arms that are none, that do not reach, that bump into the table.
