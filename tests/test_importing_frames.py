@@ -147,6 +147,17 @@ def test_segment_a_sequence(tmp_path, sequence, capsys):
     assert "dB over the background" in record["per_frame"][HIDDEN]["reason"]
 
 
+def test_an_import_of_few_frames_says_why_and_how_to_go_on(tmp_path, capsys):
+    path = tmp_path / "n.igs.mha"
+    frames = [FRAMES[k] if k < 4 else FRAMES[HIDDEN] for k in range(COUNT)]
+    write_sequence(path, {PAIR: POSES}, np.arange(COUNT) / 20, images=frames)
+    assert main(["import", str(path), str(tmp_path / "n.h5")]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    lost = "- 5 of 9 frames left out: no credible target in them (most often: nothing stands out)"
+    assert lost in lines
+    assert shlex.split(lines[-1]) == ["jaxcal", "pick", str(path)]
+
+
 def test_where_nothing_is_credible_the_way_on_is_named(tmp_path, capsys):
     path = tmp_path / "n.igs.mha"
     frames = [speckle(RNG) for _ in range(4)]

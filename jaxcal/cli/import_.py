@@ -8,7 +8,7 @@ import click
 
 from jaxcal import InputError, OutputError
 from jaxcal.cli.common import ExitCode, progress
-from jaxcal.cli.sequence_options import search_options, table_options, tracking_options
+from jaxcal.cli.sequence_options import by_hand, search_options, table_options, tracking_options
 from jaxcal.io.atomic import check_writable
 from jaxcal.io.outputs import RECORDING, check_output, is_recording
 
@@ -55,6 +55,8 @@ def import_(sources: tuple[str, ...], out: str, **options: Any) -> int:
     click.echo(f"{out}: {len(images)} images, {images.kind}s{hint}")
     for note in notes:
         click.echo(f"- {note}")
+    for line in [] if frames is None else by_hand(sources[0], frames, options):
+        click.echo(line)
     return ExitCode.CONVERGED
 
 

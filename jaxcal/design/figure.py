@@ -63,7 +63,6 @@ def plan_figure(plan: Plan, wanted_mm: float | None = None) -> Figure:
     sides = ("towards\nthe marker", "away from you", "away from\nthe marker", "towards you")
     cone.set_xticks(np.radians([0, 90, 180, 270]), sides, fontsize="small")
     cone.tick_params(axis="x", pad=14)
-    cone.set_rlabel_position(45)
     rings = np.arange(10, cone.get_ylim()[1] + 1, 10)
     if len(rings):
         cone.set_yticks(rings)

@@ -305,7 +305,9 @@ def _found_points(sequence: TrackedSequence, results: FrameResults) -> FramePoin
         )
     notes = [f"{blank} frames left out: their image was not OK"] if blank else []
     if hidden:
+        most = next(iter(results.reasons))
         notes.append(
-            f"{hidden} of {len(used) + hidden} frames left out: no credible target in them"
+            f"{hidden} of {len(used) + hidden} frames left out: no credible target in them (most "
+            f"often: {most})"
         )
     return FramePoints(used, results.position[used], "pixel", notes, results.covariance[used])
