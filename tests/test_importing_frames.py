@@ -123,6 +123,7 @@ def test_segment_a_sequence(tmp_path, sequence, capsys):
     images = jaxcal.load(tmp_path / "f-segmented.h5").calibration
     np.testing.assert_allclose(images.poses, POSES[FOUND], atol=1e-9)
     np.testing.assert_allclose(images.time, np.array(FOUND) / 20)
+    np.testing.assert_array_equal(images.frame, FOUND)
     np.testing.assert_array_equal(images.spacing_mm, [0.2, 0.15])
     error = images.measurements - POINTS[FOUND]
     assert np.abs(error).max() < 0.5

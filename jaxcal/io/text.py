@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxcal import FormatError, InputError
 from jaxcal.data.poses import QuaternionOrder, check_poses, rotations_from_quaternions
-from jaxcal.data.recording import Recording, make_images
+from jaxcal.data.recording import MINIMUM_IMAGES, Recording, make_images
 from jaxcal.io.columns import LENGTHS_MM, Columns, LengthUnit, columns_of_header
 from jaxcal.io.given_files import naming
 from jaxcal.io.table import Table, first_line, has_commented_header, parse_numbers, read_table
@@ -152,7 +152,9 @@ def read_pose_table(
 
 
 def recording_of(
-    table: PoseTable, spacing_mm: np.ndarray | tuple[float, float] | None = None
+    table: PoseTable,
+    spacing_mm: np.ndarray | tuple[float, float] | None = None,
+    minimum: int = MINIMUM_IMAGES,
 ) -> Recording:
     """The recording of a table that has poses and points.
 
@@ -168,6 +170,8 @@ def recording_of(
         table.kind,
         time=table.time,
         spacing_mm=spacing_mm,
+        frame=table.frame,
+        minimum=minimum,
         where=table.name,
     )
     return Recording(images, source=table.name)
@@ -179,6 +183,7 @@ def read_crosswire(
     *,
     spacing_mm: np.ndarray | tuple[float, float] | None = None,
     pose_units: LengthUnit = "mm",
+    minimum: int = MINIMUM_IMAGES,
 ) -> Recording:
     """Read a cross-wire recording: a text file of poses and one of pixels.
 
@@ -188,6 +193,7 @@ def read_crosswire(
         points_path: a row ``u v`` for each image: lateral and axial, px.
         spacing_mm: [lateral, axial] mm per px, when known.
         pose_units: of translations in the file.
+        minimum: least number of images.
 
     Returns:
         Images of kind ``pixel``; rotations are projected to SO(3).
@@ -217,7 +223,7 @@ def read_crosswire(
         )
     poses = rows.reshape(-1, 3, 4)
     poses[:, :, 3] *= LENGTHS_MM[pose_units]
-    images = make_images(poses, pixels, "pixel", spacing_mm=spacing_mm, where=name)
+    images = make_images(poses, pixels, "pixel", spacing_mm=spacing_mm, minimum=minimum, where=name)
     return Recording(images, source=name)
 
 

@@ -34,6 +34,7 @@ from jaxcal.report.verdict import (
     advice,
     believe,
     certainty,
+    frames_of_images,
     headline,
     length_form,
     limits,
@@ -481,7 +482,7 @@ def _residuals(record: dict[str, Any], answer: Calibration) -> str:
             "left out (to first order). Rings: the three images with the largest effect."
             "</figcaption></figure>"
         )
-    words = _paragraphs(resampled_sentences(record))
+    words = _paragraphs([*frames_of_images(record), *resampled_sentences(record)])
     columns = "".join(f"<div>{part}</div>" for part in parts)
     return _section("Image by image", f'<div class="grid">{columns}</div>', words)
 
