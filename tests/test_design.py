@@ -579,6 +579,15 @@ def test_the_figure_is_a_figure(tmp_path, count):
     last = figure.axes[2].lines[0].get_xydata()[-1]
     np.testing.assert_array_equal(last, [count, plan.tre_mm[-1]])
     assert (tmp_path / "plan.png").read_bytes().startswith(b"\x89PNG")
+    # The marker is to the right and the person below, as in the words.
+    bounds, model = plan.candidates.constraints, plan.candidates.model
+    for which, line in zip((~plan.filling, plan.filling), figure.axes[1].lines, strict=True):
+        for azimuth, pose in zip(np.asarray(line.get_xdata()), plan.poses[which], strict=True):
+            words = design.pose_in_words(pose, bounds, model.image_to_probe, model.point)
+            assert "towards the marker" not in words or np.cos(azimuth) > 0
+            assert "away from the marker" not in words or np.cos(azimuth) < 0
+            assert "towards you" not in words or np.sin(azimuth) < 0
+            assert "away from you" not in words or np.sin(azimuth) > 0
 
 
 def test_sobols_sequence_is_scipys():

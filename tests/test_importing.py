@@ -789,3 +789,35 @@ def test_only_recordings_are_replaced(tmp_path, capsys):
     )
     assert main(["import", str(table), str(tmp_path / "own.h5")]) == 0
     assert main(["import", str(table), str(tmp_path / "own.h5")]) == 0
+
+
+def test_images_are_added_to_a_recording(tmp_path, capsys):
+    """Also fewer than a recording of its own needs: what is added most often is one to three."""
+    lines = table(NAMES, COLUMNS)
+    (tmp_path / "all.csv").write_text("\n".join(lines))
+    (tmp_path / "more.csv").write_text("\n".join([lines[0], *lines[5:]]))
+    for name, rows in (("all", lines), ("first", lines[:5]), ("second", [lines[0], *lines[3:]])):
+        (tmp_path / f"{name}.csv").write_text("\n".join(rows))
+        assert main(["import", *(str(tmp_path / name) + end for end in (".csv", ".h5"))]) == 0
+    first, more, second, out = (
+        str(tmp_path / name) for name in ("first.h5", "more.csv", "second.h5", "out.h5")
+    )
+    assert main(["import", more, out]) == 2
+    assert main(["import", more, out, "--add-to", first]) == 0
+    assert "- 2 images added to the 4 of " in capsys.readouterr().out
+    joined, whole = jaxcal.load(out).calibration, jaxcal.load(tmp_path / "all.h5").calibration
+    np.testing.assert_allclose(joined.poses, whole.poses, atol=1e-12)
+    np.testing.assert_array_equal(joined.measurements, whole.measurements)
+    assert main(["import", second, out, "--add-to", first]) == 0
+    assert len(jaxcal.load(out)) == 8
+
+    def refused(*arguments: str) -> str:
+        assert main(["import", *arguments]) == 2
+        return capsys.readouterr().err
+
+    assert "is an input of this command" in refused(more, first, "--add-to", first)
+    assert "only --add-to goes with it" in refused(second, out, "--add-to", first, "--from", "A")
+    sized = (more, out, "--add-to", first, "--spacing", "0.1", "0.1")
+    assert "their pixels must be of one size" in refused(*sized)
+    assert "it holds points, not pixels" in refused(more, out, "--add-to", first, "--units", "mm")
+    assert "no such file" in refused(str(tmp_path / "none.h5"), out, "--add-to", first).lower()

@@ -123,6 +123,7 @@ def test_segment_a_sequence(tmp_path, sequence, capsys):
     images = jaxcal.load(tmp_path / "f-segmented.h5").calibration
     np.testing.assert_allclose(images.poses, POSES[FOUND], atol=1e-9)
     np.testing.assert_allclose(images.time, np.array(FOUND) / 20)
+    np.testing.assert_array_equal(images.frame, FOUND)
     np.testing.assert_array_equal(images.spacing_mm, [0.2, 0.15])
     error = images.measurements - POINTS[FOUND]
     assert np.abs(error).max() < 0.5
@@ -145,6 +146,17 @@ def test_segment_a_sequence(tmp_path, sequence, capsys):
     ]
     assert [each["frame"] for each in record["per_frame"] if each["fate"] == "found"] == FOUND
     assert "dB over the background" in record["per_frame"][HIDDEN]["reason"]
+
+
+def test_an_import_of_few_frames_says_why_and_how_to_go_on(tmp_path, capsys):
+    path = tmp_path / "n.igs.mha"
+    frames = [FRAMES[k] if k < 4 else FRAMES[HIDDEN] for k in range(COUNT)]
+    write_sequence(path, {PAIR: POSES}, np.arange(COUNT) / 20, images=frames)
+    assert main(["import", str(path), str(tmp_path / "n.h5")]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    lost = "- 5 of 9 frames left out: no credible target in them (most often: nothing stands out)"
+    assert lost in lines
+    assert shlex.split(lines[-1]) == ["jaxcal", "pick", str(path)]
 
 
 def test_where_nothing_is_credible_the_way_on_is_named(tmp_path, capsys):

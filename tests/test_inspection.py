@@ -145,9 +145,14 @@ def test_an_image_whose_range_is_off_is_a_suspect():
     middle = int(np.argmin(np.abs(place[:, 0]) + np.abs(place[:, 1] - 50.0)))
     sd = 1.4826 * np.median(np.abs(np.asarray(clean.residual)[:, 2]))
     off = replace(data, measurements=data.measurements.at[middle, 1].add(-6 * sd))
-    found = suspects(jaxcal.calibrate(off, "conventional"))
+    result = jaxcal.calibrate(off, "conventional")
+    found = suspects(result)
     assert [each["image"] for each in found] == [middle]
     assert found[0]["component"] == "range"
+    # The figures mark whom the verdict names.
+    ring = result.plot_residuals().axes[1].lines[-1]
+    np.testing.assert_array_equal(ring.get_xdata(), [middle])
+    assert "or suspicious" in str(ring.get_label())
 
 
 def test_complaints_are_warnings_in_words():

@@ -12,6 +12,9 @@ from scipy.spatial.transform import Rotation
 import jaxcal
 from jaxcal import InputError
 from jaxcal.cli.main import main
+from jaxcal.io.frame_poses import tool_poses
+from jaxcal.io.import_options import ImportOptions
+from jaxcal.io.sequence_files import write_sequence
 from jaxcal.io.text import read_poses
 
 TIP, POINT = np.array([3.0, -20.0, 150.0]), np.array([100.0, -200.0, 900.0])
@@ -193,3 +196,31 @@ def test_real_recording_with_outliers_reaches_the_clean_ones_precision(real_data
         read_poses(folder / "pivotCalibrationDataWithOutliers.txt"), robust=False
     )
     assert float(plain.rms) == pytest.approx(33.6, abs=0.1)
+
+
+def test_poses_of_a_tool_are_read_from_sequences_and_tables(tmp_path):
+    poses = swung(random_rotations(5))
+    seen = np.array([True, True, False, True, True])
+    pair, other = ("Stylus", "Tracker"), ("Probe", "Tracker")
+    file = tmp_path / "pivot.igs.mha"
+    write_sequence(file, {other: poses[::-1], pair: poses}, np.arange(5.0), valid={pair: seen})
+    read, notes = tool_poses(file, ImportOptions())
+    np.testing.assert_allclose(read, poses[seen], atol=1e-9)
+    assert notes[0].startswith("poses from Stylus to Tracker")
+    assert notes[1] == "1 of 5 frames left out: their tracking was not OK"
+    probe, _ = tool_poses(file, ImportOptions(source="Probe"))
+    np.testing.assert_allclose(probe, poses[::-1], atol=1e-9)
+
+    scalar_first = Rotation.from_matrix(poses[:, :3, :3]).as_quat()[:, [3, 0, 1, 2]]
+    rows = np.concatenate([poses[:, :3, 3] / 1000, scalar_first], axis=1)
+    lines = [",".join(map(repr, row.tolist())) for row in rows]
+    table = tmp_path / "pivot.csv"
+    table.write_text("\n".join(["x [m],y [m],z [m],qw,qx,qy,qz", *lines[:3], ",,,,,,", lines[4]]))
+    read, notes = tool_poses(table, ImportOptions(skip_invalid=True))
+    np.testing.assert_allclose(read, poses[[0, 1, 2, 4]], atol=1e-9)
+    assert notes == [f"{table}: 1 invalid rows left out"]
+    table.write_text("\n".join(lines))
+    read, _ = tool_poses(table, ImportOptions(quaternion="wxyz", pose_units="m"))
+    np.testing.assert_allclose(read, poses, atol=1e-9)
+    with pytest.raises(InputError, match="--from is for sequences"):
+        tool_poses(table, ImportOptions(source="Stylus"))

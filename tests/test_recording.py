@@ -68,6 +68,15 @@ except jaxcal.InputError as error:
 """
 
 
+def test_numbers_of_frames_are_whole():
+    given = arrays()
+    numbers = np.array([0, 2, 3, 9, 10, 11])
+    np.testing.assert_array_equal(jaxcal.make_images(**given, frame=numbers).frame, numbers)
+    for bad in (0.5, -1, np.nan):
+        with pytest.raises(InputError, match="frame 1 is no"):
+            jaxcal.make_images(**given, frame=np.array([0, bad, 2, 3, 4, 5]))
+
+
 def test_traced_arrays_are_refused_in_words():
     # In another process: here, annotations are checked at every call.
     done = subprocess.run([sys.executable, "-c", TRACED], capture_output=True, text=True)

@@ -21,7 +21,7 @@ from jaxcal.report.paragraphs import laid_out, listed
 from jaxcal.report.plots import convergence_figure, plot_offsets, plot_residuals
 from jaxcal.report.record import calibration_record, check_test_images, plain, truth_error
 from jaxcal.report.tables import calibration_table, comparison_table
-from jaxcal.report.verdict import verdict
+from jaxcal.report.verdict import frames_of_images, verdict
 from jaxcal.report.write import COLUMNS, prepare_folder, write_report
 from jaxcal.result.calibration import Status
 from jaxcal.solvers.plan import Options
@@ -392,6 +392,26 @@ def test_report_files(written, record, result):
         content = path.read_bytes()
         assert content.startswith(b"\x89PNG")
         assert content.endswith(b"IEND\xaeB`\x82")
+
+
+def test_frames_of_the_images_that_are_named_are_told(record, tmp_path, result, recording):
+    named = {"outliers": [3], "suspects": [{"image": 7}], "influence": {"most": [5, 0, 3, 9]}}
+    told = frames_of_images(record | named | {"frame": [k + (k > 4) for k in range(20)]})
+    assert told == [
+        "Images are counted from 0 in the recording; in the file that it came from, image 5 is "
+        "frame 6, image 7 is frame 8."
+    ]
+    assert frames_of_images(record | named | {"frame": list(range(20))}) == []
+    assert frames_of_images(record | named) == []
+    images = dataclasses.replace(recording.calibration, frame=3 * np.arange(20))
+    imported = dataclasses.replace(recording, calibration=images)
+    jaxcal.save(imported, tmp_path / "rec.h5")
+    np.testing.assert_array_equal(
+        jaxcal.load(tmp_path / "rec.h5").calibration.frame, 3 * np.arange(20)
+    )
+    write_report(tmp_path, record, result, imported, [])
+    with (tmp_path / "residuals.csv").open() as table:
+        assert [row["frame"] for row in csv.DictReader(table)][:3] == ["0", "3", "6"]
 
 
 def test_report_of_a_failed_solve(tmp_path, failed, recording):

@@ -229,6 +229,7 @@ def test_ros_says_what_a_rigid_transform_cannot_hold(tmp_path, capsys):
     )
     assert f"- not in this rigid transform: {note}" in capsys.readouterr().out
     assert f"# not in this rigid transform: {note}" in (tmp_path / "a.yaml").read_text()
+    assert "x lateral (along u), y elevational, z depth" in (tmp_path / "a.yaml").read_text()
     # With that both agree.
     pixel = np.array([300.0, 400.0])
     lateral, deep = known.scale_mm_per_px * pixel

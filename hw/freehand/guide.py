@@ -210,7 +210,9 @@ class Guide:
                     f"turn the probe more (its orientations differ by {spread[0]:.0f} degrees)"
                 )
             elif spread[1] < _WIDE_DEG:
-                missing.append("turn it about another axis: tilt and rock it, not only one of both")
+                missing.append(
+                    "turn the probe about another axis as well (tilt, rock and twist it)"
+                )
         return "; ".join(missing) or "well covered: any other pose helps"
 
     def _empty_cell(self, size: tuple[int, int]) -> str | None:

@@ -8,9 +8,9 @@ import click
 
 from jaxcal import InputError, OutputError
 from jaxcal.cli.common import ExitCode, progress
-from jaxcal.cli.sequence_options import search_options, table_options, tracking_options
+from jaxcal.cli.sequence_options import by_hand, search_options, table_options, tracking_options
 from jaxcal.io.atomic import check_writable
-from jaxcal.io.outputs import RECORDING, check_output, is_recording
+from jaxcal.io.outputs import RECORDING, check_output, is_hdf5_recording, is_recording
 
 
 @click.command("import")
@@ -31,7 +31,14 @@ from jaxcal.io.outputs import RECORDING, check_output, is_recording
     "each frame.",
 )
 @search_options
-def import_(sources: tuple[str, ...], out: str, **options: Any) -> int:
+@click.option(
+    "--add-to",
+    type=click.Path(),
+    metavar="REC.h5",
+    help="Recording to which the images are added: OUT.h5 has those of both. The target must be "
+    "where it was, and the markers on the probe as well. SOURCE may then be a recording, too.",
+)
+def import_(sources: tuple[str, ...], out: str, add_to: str | None, **options: Any) -> int:
     """Turn other programs' files into a recording, OUT.h5.
 
     SOURCE is one of: a table (CSV) with a pose and a point in each row; a tracked sequence of PLUS
@@ -41,24 +48,43 @@ def import_(sources: tuple[str, ...], out: str, **options: Any) -> int:
     rows of four numbers for each image) and POINTS (a row "u v" in pixels).
     docs/reference/formats.md says what each must hold.
     """
-    _check(sources, out, options)
-    from jaxcal.io.hdf5 import save
+    _check(sources, out, add_to, options)
+    from jaxcal.data.recording import MINIMUM_IMAGES, joined
+    from jaxcal.io.hdf5 import load, save
     from jaxcal.io.import_options import ImportOptions
     from jaxcal.io.importing import import_files
 
+    first = None if add_to is None else load(add_to)
     with progress("importing"):
-        recording, notes, frames = import_files(sources, ImportOptions(**options))
-    save(recording, out, frames)
+        if first is not None and len(sources) == 1 and is_hdf5_recording(sources[0]):
+            if ImportOptions(**options) != ImportOptions():
+                raise InputError(f"{sources[0]}: is a recording: only --add-to goes with it")
+            recording, notes, frames = load(sources[0]), [], None
+        else:
+            least = MINIMUM_IMAGES if first is None else 1
+            asked = ImportOptions(**options, minimum=least)
+            recording, notes, frames = import_files(sources, asked)
+    if first is None:
+        save(recording, out, frames)
+    else:
+        added = len(recording)
+        notes = [f"{added} images added to the {len(first)} of {add_to}", *notes]
+        if (first.calibration.covariance is None) != (recording.calibration.covariance is None):
+            notes.append("covariances of the points are left out: only some images have them")
+        recording = joined(first, recording)
+        save(recording, out)
     images = recording.calibration
     unscaled = images.kind == "pixel" and images.spacing_mm is None
     hint = "; their size is not known: calibrate with --estimate scale" if unscaled else ""
     click.echo(f"{out}: {len(images)} images, {images.kind}s{hint}")
     for note in notes:
         click.echo(f"- {note}")
+    for line in [] if frames is None else by_hand(sources[0], frames, options):
+        click.echo(line)
     return ExitCode.CONVERGED
 
 
-def _check(sources: tuple[str, ...], out: str, options: dict[str, Any]) -> None:
+def _check(sources: tuple[str, ...], out: str, add_to: str | None, options: dict[str, Any]) -> None:
     if len(sources) > 2:
         raise click.UsageError(
             f"{len(sources)} sources; one table or sequence, or two files that belong together, "
@@ -66,7 +92,7 @@ def _check(sources: tuple[str, ...], out: str, options: dict[str, Any]) -> None:
         )
     if options["spacing_mm"] is not None and options["units"] == "mm":
         raise click.BadParameter("points in mm have no pixel size", param_hint="--spacing")
-    named = [*sources, options["poses"], options["spacing_from"]]
+    named = [*sources, add_to, options["poses"], options["spacing_from"]]
     read = [each for each in named if each is not None]
     try:
         check_output(out, "a recording", is_recording, read, endings=RECORDING)

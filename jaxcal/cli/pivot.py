@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import click
 
+from jaxcal import InputError
 from jaxcal.cli.common import (
     exit_code,
     import_engine,
@@ -12,33 +15,49 @@ from jaxcal.cli.common import (
     print_page,
     progress,
 )
+from jaxcal.cli.sequence_options import table_options
 
 
 @click.command()
 @click.argument("poses", type=click.Path(), metavar="POSES")
+@click.option("--from", "source", metavar="FRAME", help="Tracked tool; Stylus by default.")
+@click.option(
+    "--to",
+    "target",
+    metavar="FRAME",
+    help="Frame in which the pivot point does not move; by default Reference if it was tracked.",
+)
+@table_options
 @click.option(
     "--no-robust", is_flag=True, help="Use every pose, also those that do not fit the rest."
 )
 @json_option
-def pivot(poses: str, no_robust: bool, as_json: bool) -> int:
+def pivot(poses: str, no_robust: bool, as_json: bool, **options: Any) -> int:
     """Find the tip of a tracked tool that was turned about its tip.
 
-    POSES is a text file with a row for each pose, tool -> tracker, mm: x y z qx qy qz qs, or the
-    matrix row by row (12 or 16 numbers). Poses that do not fit the rest are left out and named.
+    POSES is a sequence of PLUS or Slicer, an export of NDI ToolBox or Motive, a table (CSV) with a
+    header, or a text file with a row for each pose, tool -> tracker, mm: x y z qx qy qz qs, or the
+    matrix row by row (12 or 16 numbers). Poses that do not fit the rest are left out and named;
+    they are counted from 0, without those that were not tracked.
     """
     import_engine()
     from jaxcal.calibration.pivot import calibrate_pivot
+    from jaxcal.data.recording import MetresError
+    from jaxcal.io.frame_poses import tool_poses
     from jaxcal.io.given_files import naming
-    from jaxcal.io.text import read_poses
+    from jaxcal.io.import_options import ImportOptions
     from jaxcal.report.pivot import pivot_lines
     from jaxcal.runtime.jax_cache import enable_compilation_cache
 
-    measured = read_poses(poses)
+    measured, notes = tool_poses(poses, ImportOptions(**options))
     enable_compilation_cache()
     with progress("calibrating the pivot"), naming(poses):
-        record = calibrate_pivot(measured, robust=not no_robust).record()
+        try:
+            record = calibrate_pivot(measured, robust=not no_robust).record()
+        except MetresError as error:
+            raise InputError(f"{error} (--pose-units m)") from None
     if as_json:
         print_json(record)
     else:
-        print_page(*pivot_lines(record))
+        print_page(*pivot_lines(record), *(f"- {note}" for note in notes))
     return exit_code([record])

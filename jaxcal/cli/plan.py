@@ -324,6 +324,7 @@ def _print(found: Plan, record: dict[str, Any], figure: str | None) -> None:
         for wanted, count in record["images_to_tre_mm"].items()
     ]
     (near, far), (left, right) = (record["region"][k] for k in ("depth_mm", "lateral_mm"))
+    total = "" if not there else ", the existing ones included,"
     before = "" if not there else f" added to the {there} existing ones"
     these = "this image" if len(found) == 1 else f"these {len(found)} images"
     print_page(
@@ -333,7 +334,7 @@ def _print(found: Plan, record: dict[str, Any], figure: str | None) -> None:
         "the lateral position is smallest. Take them in any order.",
         f"Predicted with {these}{before}: error over the image "
         f"{found.tre_mm[-1]:.2g} mm, reconstruction precision {found.rp_mm[-1]:.2g} mm.",
-        *([f"Images needed for an error of {'; '.join(counts)}."] if counts else []),
+        *([f"Images needed{total} for an error of {'; '.join(counts)}."] if counts else []),
         *(_simulated_in_words(errors) for errors in record.get("simulated", ())),
         *([] if figure is None else [f"figure: {figure}"]),
     )

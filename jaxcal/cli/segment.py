@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shlex
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -14,7 +13,6 @@ from jaxcal import InputError
 from jaxcal.cli.common import (
     POSITIVE,
     ExitCode,
-    Verbatim,
     import_engine,
     json_option,
     print_json,
@@ -23,7 +21,7 @@ from jaxcal.cli.common import (
 )
 from jaxcal.cli.sequence_options import (
     beside,
-    given_options,
+    by_hand,
     search_options,
     table_options,
     tracking_options,
@@ -184,7 +182,7 @@ def _segment_frames(source: str, out: str | None, as_json: bool, options: dict[s
         print_json(_frames_record(target, recording, notes, found))
     else:
         told = _frames_lines(target, recording, notes, found)
-        print_page(*told, *_by_hand(source, found, options))
+        print_page(*told, *by_hand(source, found, options))
     return ExitCode.CONVERGED
 
 
@@ -229,19 +227,6 @@ def _frames_lines(
         *([f"- other frames: {others}"] if others else []),
         *(f"- not credible: {count} x {why}" for why, count in found.reasons.items()),
         *(f"- {note}" for note in notes if "left out" not in note),
-    ]
-
-
-def _by_hand(source: str, found: FrameResults, options: dict[str, Any]) -> list[str]:
-    """The command that places points by hand, where the target was found in few frames."""
-    if found.counts["not credible"] <= found.counts["found"]:
-        return []
-    again = given_options(options, orientation=True)
-    later = ", and import them with --lag auto" if options["lag_s"] == "auto" else ""
-    return [
-        "- few show a credible target: check --region and --target, or place the points by "
-        f"hand{later}:",
-        Verbatim("  " + shlex.join(["jaxcal", "pick", source, *again])),
     ]
 
 

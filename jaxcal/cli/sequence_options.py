@@ -5,13 +5,17 @@ from __future__ import annotations
 import math
 import os
 import re
+import shlex
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from jaxcal.cli.common import POSITIVE
+from jaxcal.cli.common import POSITIVE, Verbatim
+
+if TYPE_CHECKING:
+    from jaxcal.io.target_search import FrameResults
 
 Command = Callable[..., Any]
 
@@ -163,6 +167,19 @@ def given_options(options: dict[str, Any], *, orientation: bool = False) -> list
         for part in (f"--{name}", f"{value}")
     ]
     return stated + ["--skip-invalid"] * options["skip_invalid"]
+
+
+def by_hand(source: str, found: FrameResults, options: dict[str, Any]) -> list[str]:
+    """The command that places points by hand, where the target was found in few frames."""
+    if found.counts["not credible"] <= found.counts["found"]:
+        return []
+    again = given_options(options, orientation=True)
+    later = ", and import them with --lag auto" if options["lag_s"] == "auto" else ""
+    return [
+        "- few show a credible target: check --region and --target, or place the points by "
+        f"hand{later}:",
+        Verbatim("  " + shlex.join(["jaxcal", "pick", source, *again])),
+    ]
 
 
 def beside(frames: str, ending: str) -> str:

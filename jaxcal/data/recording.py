@@ -7,7 +7,7 @@ rely on shapes, units and finite values.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -15,7 +15,7 @@ import numpy as np
 from jaxcal import InputError
 from jaxcal.data.poses import check_poses
 from jaxcal.data.probe import Probe, check_probe
-from jaxcal.runtime.array_types import Bool, Float
+from jaxcal.runtime.array_types import Bool, Float, Int
 from jaxcal.runtime.arrays import is_traced
 from jaxcal.runtime.given_values import is_number, real_array
 from jaxcal.runtime.messages import shown
@@ -25,6 +25,9 @@ MINIMUM_IMAGES = 4
 
 LARGEST = 1e7
 """Largest coordinate accepted, in mm or px, and largest variance of one: ten kilometres."""
+
+LARGEST_FRAME = 2**53
+"""Largest number of a frame; larger ones are not exact in float64."""
 
 LEAST_REACH_MM = 5.0
 """No tracker sees a tool nearer to its origin than this in all poses."""
@@ -61,6 +64,7 @@ class Images:
         spacing_mm: (2,) mm per px [lateral, axial] for pixels; None when unknown.
         face_offset_mm: range of pixel row 0, mm.
         time_of_flight: (n, elements) the times, s, that points were segmented from, or None.
+        frame: (n,) number of each image's frame in the file that it came from, or None.
     """
 
     poses: Float[np.ndarray, "n 4 4"]
@@ -74,6 +78,7 @@ class Images:
     spacing_mm: Float[np.ndarray, 2] | None = None
     face_offset_mm: float = 0.0
     time_of_flight: Float[np.ndarray, "n elements"] | None = None
+    frame: Int[np.ndarray, " n"] | None = None
 
     def __len__(self) -> int:
         return len(self.poses)
@@ -128,6 +133,43 @@ class Recording:
         return len(self.calibration)
 
 
+def joined(first: Recording, second: Recording) -> Recording:
+    """The calibration images of two recordings of one target, in this order, as one recording.
+
+    What only one of them states of every image (covariances, times, ...) is left out, and so is the
+    truth of a simulation. Test images are those of the first.
+
+    Raises:
+        InputError: the images differ in kind, size of a pixel or probe.
+    """
+    a, b = first.calibration, second.calibration
+    where = f"{second.source} cannot be added to {first.source}"
+    if a.kind != b.kind:
+        raise InputError(f"{where}: it holds {b.kind}s, not {a.kind}s")
+    sizes = [None if each.spacing_mm is None else each.spacing_mm.tolist() for each in (a, b)]
+    if sizes[0] != sizes[1] or a.face_offset_mm != b.face_offset_mm:
+        raise InputError(
+            f"{where}: their pixels must be of one size, known in both recordings or in neither "
+            "(--spacing states it)"
+        )
+    if None not in (first.probe, second.probe) and first.probe != second.probe:
+        raise InputError(f"{where}: their probes differ")
+
+    def both(name: str) -> Any:
+        values = getattr(a, name), getattr(b, name)
+        return None if any(value is None for value in values) else np.concatenate(values)
+
+    names = ("poses", "measurements", "mask", "covariance", "max_elevation", "amplitude")
+    names += ("time", "time_of_flight", "frame")
+    return replace(
+        first,
+        calibration=replace(a, **{name: both(name) for name in names}),
+        truth=None,
+        probe=first.probe or second.probe,
+        source=f"{first.source} with {second.source}",
+    )
+
+
 def check_recording(value: object, name: str) -> None:
     """Raise InputError, which names the function, if what a caller gave is no recording."""
     if not isinstance(value, Recording):
@@ -162,6 +204,7 @@ def make_images(
     spacing_mm: np.ndarray | tuple[float, float] | None = None,
     face_offset_mm: float = 0.0,
     time_of_flight: np.ndarray | None = None,
+    frame: np.ndarray | None = None,
     minimum: int = MINIMUM_IMAGES,
     where: str = "",
 ) -> Images:
@@ -179,6 +222,7 @@ def make_images(
         spacing_mm: [lateral, axial] mm per px, pixels only.
         face_offset_mm: range of pixel row 0, mm.
         time_of_flight: (n, elements) s, points only: the times that they were segmented from.
+        frame: (n,) numbers of the images' frames in the file that they came from.
         minimum: least number of used images (0 for a test set).
         where: prefix of error messages, e.g. a file's name.
 
@@ -231,6 +275,7 @@ def make_images(
             spacing_mm=spacing,
             face_offset_mm=face_mm,
             time_of_flight=_raw_times(time_of_flight, kind, count, used),
+            frame=_frame(frame, count),
         )
         _check_units(images)
         return images
@@ -389,6 +434,15 @@ def _per_image(
     values[~used] = fill
     _refuse(name, ~np.isfinite(values), "is NaN or Inf")
     return values
+
+
+def _frame(values: np.ndarray | None, count: int) -> Int[np.ndarray, " n"] | None:
+    if values is None:
+        return None
+    numbers = _shaped(values, "frame", (count,))
+    _refuse("frame", ~((numbers >= 0) & (numbers <= LARGEST_FRAME)), "is no number of a frame")
+    _refuse("frame", numbers != np.round(numbers), "is no whole number")
+    return numbers.astype(np.int64)
 
 
 def _covariance(

@@ -47,9 +47,10 @@ def plan_figure(plan: Plan, wanted_mm: float | None = None) -> Figure:
     for which, colour, label in ((~filling, _BLUE, "chosen"), (filling, _ORANGE, "fills space")):
         places = plan.targets[which]
         image.plot(places[:, 0], places[:, 2], "o", color=colour, markersize=4, label=label)
-        azimuth = np.arctan2(numbers[which, 3], numbers[which, 2])
+        # Where the handle goes, as in words.py: the marker is to the right, the person below.
+        azimuth = np.arctan2(-numbers[which, 2], -numbers[which, 3])
         tilt = np.degrees(np.hypot(numbers[which, 2], numbers[which, 3]))
-        cone.plot(azimuth, tilt, "o", color=colour, markersize=4)
+        cone.plot(azimuth, tilt, "o", color=colour, markersize=4, clip_on=False)
     image.set(
         xlabel="lateral (mm)", ylabel="depth (mm)", title="target in the image", aspect="equal"
     )
@@ -58,7 +59,10 @@ def plan_figure(plan: Plan, wanted_mm: float | None = None) -> Figure:
     image.legend(
         fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, frameon=False
     )
-    cone.set_title("tilt (degrees)", pad=18)
+    cone.set_title("tilt of the handle (degrees)", pad=18)
+    sides = ("towards\nthe marker", "away from you", "away from\nthe marker", "towards you")
+    cone.set_xticks(np.radians([0, 90, 180, 270]), sides, fontsize="small")
+    cone.tick_params(axis="x", pad=14)
     rings = np.arange(10, cone.get_ylim()[1] + 1, 10)
     if len(rings):
         cone.set_yticks(rings)

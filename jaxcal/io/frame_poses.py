@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,6 +14,8 @@ from jaxcal.io.import_options import ImportOptions, refuse
 from jaxcal.io.poses_by_time import Tracking, times_of_table, with_poses_by_time
 from jaxcal.io.sequence import FolderPixels, TrackedSequence
 from jaxcal.io.sources import kind_of, read_rows, read_tracked
+from jaxcal.io.table import first_line
+from jaxcal.io.text import read_poses
 from jaxcal.runtime.array_types import Bool, Float
 from jaxcal.runtime.messages import quoted
 
@@ -102,6 +105,37 @@ def tracked_poses(
     return poses, valid, notes
 
 
+def tool_poses(
+    source: str | os.PathLike[str], options: ImportOptions
+) -> tuple[Float[np.ndarray, "n 4 4"], list[str]]:
+    """Poses of a tracked tool, mm, from a sequence, a tracker's export or a table; and notes.
+
+    Of a sequence, the tool is the stylus if none is named and one was tracked.
+
+    Raises:
+        InputError: a file that cannot be read or holds no poses, or an option that is not used.
+    """
+    kind = kind_of(source)
+    if kind in ("sequence", "tracker", "scan"):
+        refuse(options, ("quaternion", "skip_invalid"), "is for tables, but no table is read")
+        sequence = read_tracked(source, options.pose_units)
+        if options.source is None and "Stylus" in sequence.frames():
+            options = replace(options, source="Stylus")
+        poses, valid, notes = tracked_poses(sequence, options)
+        return poses[valid], notes
+    if kind != "table":
+        raise InputError(f"{os.fspath(source)}: holds no poses of a tool")
+    refuse(options, ("source", "target"), "is for sequences and trackers' exports, not for a table")
+    if not first_line(source)[1]:
+        refuse(options, ("skip_invalid",), "is for tables with a header")
+        quaternion, unit = options.quaternion or "xyzw", options.pose_units or "mm"
+        return read_poses(source, quaternion=quaternion, pose_units=unit), []
+    table = read_rows(source, options, ignore_time=True)
+    if table.poses is None:
+        raise InputError(f"{table.name}: holds no poses")
+    return table.poses, table.notes
+
+
 def frames_to_show(
     sequence: TrackedSequence, options: ImportOptions, every: int = 1
 ) -> tuple[list[int], tuple[int, int], list[str]]:
@@ -155,7 +189,7 @@ def _chosen_frames(sequence: TrackedSequence, options: ImportOptions) -> tuple[s
         start = "Probe" if "Probe" in tools else tools[0] if len(tools) == 1 else None
     if start is None:
         raise InputError(
-            f"{sequence.source}: name the tracked frame on the probe (--from); there are "
+            f"{sequence.source}: name the tracked frame on the probe or tool (--from); there are "
             f"{', '.join(map(quoted, tools))}"
         )
     start = start if start in names else capitalised(start)

@@ -8,7 +8,8 @@
                  point (n, 2) [mm: lateral, range], pixel (n, 2) [px: u lateral, v axial],
                  time_of_flight (n, elements) [s, one-way, NaN = no response; needs /probe];
                  optional covariance (n, 2, 2) [mm^2, px^2 for pixels], amplitude (n,),
-                 mask (n,) bool, time (n,) [s], max_elevation (n,) [mm];
+                 mask (n,) bool, time (n,) [s], max_elevation (n,) [mm],
+                 frame (n,): numbers of the frames in the file that the images came from;
                  pixel has attrs spacing_mm [lateral, axial] and face_offset_mm, both optional
     /test        optional, as /calibration
     /truth       optional; image_to_probe (4, 4), point (3,), elevation (n,) [mm]
@@ -81,7 +82,7 @@ _SPELLINGS = {
 }
 # Dimensionless, or of any unit: written as "1" and not compared.
 _FREE = "1"
-_PER_IMAGE = {"amplitude": _FREE, "time": "s", "max_elevation": "mm"}
+_PER_IMAGE = {"amplitude": _FREE, "time": "s", "max_elevation": "mm", "frame": _FREE}
 """Optional numbers, one an image, and their units."""
 
 

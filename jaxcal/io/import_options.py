@@ -9,6 +9,7 @@ from typing import Literal
 
 from jaxcal import InputError
 from jaxcal.data.poses import QuaternionOrder
+from jaxcal.data.recording import MINIMUM_IMAGES
 from jaxcal.io.columns import LengthUnit
 from jaxcal.io.frame_points import Assignment
 
@@ -37,6 +38,7 @@ class ImportOptions:
         lag_s: with ``poses``: an image stamped t shows what was at t - lag; ``auto``: estimated
             from the motion of the points in the images.
         spacing_from: DICOM clip that states the pixel size.
+        minimum: least number of images.
     """
 
     source: str | None = None
@@ -54,6 +56,7 @@ class ImportOptions:
     poses: str | os.PathLike[str] | None = None
     lag_s: float | Literal["auto"] = 0.0
     spacing_from: str | os.PathLike[str] | None = None
+    minimum: int = MINIMUM_IMAGES
 
 
 _FLAGS = {

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.data.recording import MINIMUM_IMAGES, MetresError, Recording, make_images
+from jaxcal.data.recording import MetresError, Recording, make_images
 from jaxcal.io.frame_points import FramePoints, points_of_markups, points_of_table
 from jaxcal.io.frame_poses import opened, tracked_poses
 from jaxcal.io.import_options import ImportOptions, refuse
@@ -78,7 +78,10 @@ def import_files(
         refuse(options, unused, "does not go with a pair of text files, poses and points")
         with _naming_pose_units(options):
             pair = read_crosswire(
-                *sources, spacing_mm=options.spacing_mm, pose_units=options.pose_units or "mm"
+                *sources,
+                spacing_mm=options.spacing_mm,
+                pose_units=options.pose_units or "mm",
+                minimum=options.minimum,
             )
         return Imported(pair, [])
     if len(sources) != 1 or kinds[0] != "table":
@@ -94,7 +97,7 @@ def import_files(
         time, said = _good_time(table.time, lambda row: f"{table.name}:{table.lines[row]}", options)
         table, notes = replace(table, time=time), notes + said
     with _naming_pose_units(options, table.length_stated):
-        return Imported(recording_of(table, options.spacing_mm), notes)
+        return Imported(recording_of(table, options.spacing_mm, options.minimum), notes)
 
 
 @contextmanager
@@ -156,7 +159,7 @@ def _from_sequence(
             results = (
                 _search(sequence, valid, options) if results is None else results.of_tracked(valid)
             )
-            used = _found_points(sequence, results)
+            used = _found_points(sequence, results, options.minimum)
         else:
             where += f" with {os.fspath(points)}"
             notes += placed.notes + _mirrored(sequence, points)
@@ -175,6 +178,8 @@ def _from_sequence(
             covariance=used.covariance,
             time=time,
             spacing_mm=spacing,
+            frame=sequence.numbers_of(used.rows),
+            minimum=options.minimum,
             where=where,
         )
     notes += used.notes + said
@@ -292,20 +297,22 @@ def _search(
     )
 
 
-def _found_points(sequence: TrackedSequence, results: FrameResults) -> FramePoints:
+def _found_points(sequence: TrackedSequence, results: FrameResults, minimum: int) -> FramePoints:
     """The target as it was found in the frames."""
     counts, used = results.counts, results.found
     blank, hidden = counts["image not OK"], counts["not credible"]
-    if len(used) < MINIMUM_IMAGES:
+    if len(used) < minimum:
         most = next(iter(results.reasons), "there are no frames")
         raise InputError(
             f"{sequence.source}: only {len(used)} of {len(used) + hidden} frames show a credible "
-            f"target, at least {MINIMUM_IMAGES} are needed (most often: {most}); place the points "
+            f"target, at least {minimum} are needed (most often: {most}); place the points "
             "by hand: jaxcal pick"
         )
     notes = [f"{blank} frames left out: their image was not OK"] if blank else []
     if hidden:
+        most = next(iter(results.reasons))
         notes.append(
-            f"{hidden} of {len(used) + hidden} frames left out: no credible target in them"
+            f"{hidden} of {len(used) + hidden} frames left out: no credible target in them (most "
+            f"often: {most})"
         )
     return FramePoints(used, results.position[used], "pixel", notes, results.covariance[used])

@@ -81,6 +81,17 @@ def begins_with(*starts: bytes) -> Callable[[Path], bool]:
     return is_one
 
 
+def is_hdf5_recording(path: Path) -> bool:
+    """Whether a file is in our format, of an acquisition or not."""
+    from jaxcal.io.hdf5 import FORMAT
+    from jaxcal.io.untrusted import open_root, text
+
+    if not (os.path.isfile(path) and begins_with(_HDF5)(path)):
+        return False
+    with open_root(path) as root:
+        return text(root, "format") == FORMAT
+
+
 def is_recording(path: Path) -> bool:
     """Whether a file is one of our recordings, with nothing that would be lost by writing another.
 

@@ -100,6 +100,7 @@ def ros_yaml(
     noted = "" if note is None else f"# {note}\n"
     return (
         f"# {child} in {parent}: metres, unit quaternion with the scalar last.\n"
+        f"# axes of {child}: x lateral (along u), y elevational, z depth (along v)\n"
         f"{noted}"
         f"# {static_transform_command(matrix, parent, child)}\n"
         "parameters:\n"

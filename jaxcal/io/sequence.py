@@ -144,6 +144,11 @@ class TrackedSequence:
             return quoted(self.files[row])
         return f"frame {row if self.numbers is None else self.numbers[row]}"
 
+    def numbers_of(self, rows: Int[np.ndarray, " m"]) -> Int[np.ndarray, " m"] | None:
+        """Numbers by which other files name these frames; None if one of them has none."""
+        numbers = rows if self.numbers is None else self.numbers[rows]
+        return numbers if (numbers >= 0).all() else None
+
     def rows_of(
         self, numbers: Int[np.ndarray, " m"], labels: Sequence[str]
     ) -> Int[np.ndarray, " m"]:

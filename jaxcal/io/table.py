@@ -117,7 +117,7 @@ def read_table(
             separator = stated[1]
             continue
         if separator is None:
-            separator = next((mark for mark in (";", "\t", ",") if mark in content.strip()), "")
+            separator = _separator_of(content)
         cells = _cells(content, separator)
         if header and not rows and names is None and _is_header(cells, separator):
             # Some programs end every line, the header's too, with a separator.
@@ -142,6 +142,15 @@ def read_table(
     return Table(name, names, rows, lines, separator or "")
 
 
+def first_line(path: str | os.PathLike[str]) -> tuple[str, bool]:
+    """Separator in the first line of a table, and whether it names the columns."""
+    for _, content in text_lines(path):
+        if not _STATED_SEPARATOR.fullmatch(content.strip("\r\n")):
+            separator = _separator_of(content)
+            return separator, _is_header(_cells(content, separator), separator)
+    return "", False
+
+
 def has_commented_header(table: Table) -> bool:
     """Whether the comment just before the first row has as many cells, as numpy writes a header."""
     before = ""
@@ -151,6 +160,10 @@ def has_commented_header(table: Table) -> bool:
         before = content.strip()
     cells = _cells(before.removeprefix("#").strip(), table.separator)
     return before.startswith("#") and len(cells) == len(table.rows[0])
+
+
+def _separator_of(content: str) -> str:
+    return next((mark for mark in (";", "\t", ",") if mark in content.strip()), "")
 
 
 def _cells(content: str, separator: str) -> list[str]:

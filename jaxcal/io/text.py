@@ -15,10 +15,10 @@ import numpy as np
 
 from jaxcal import FormatError, InputError
 from jaxcal.data.poses import QuaternionOrder, check_poses, rotations_from_quaternions
-from jaxcal.data.recording import Recording, make_images
+from jaxcal.data.recording import MINIMUM_IMAGES, Recording, make_images
 from jaxcal.io.columns import LENGTHS_MM, Columns, LengthUnit, columns_of_header
 from jaxcal.io.given_files import naming
-from jaxcal.io.table import Table, has_commented_header, parse_numbers, read_table
+from jaxcal.io.table import Table, first_line, has_commented_header, parse_numbers, read_table
 from jaxcal.runtime.array_types import Float, Int
 from jaxcal.runtime.messages import quoted
 
@@ -152,7 +152,9 @@ def read_pose_table(
 
 
 def recording_of(
-    table: PoseTable, spacing_mm: np.ndarray | tuple[float, float] | None = None
+    table: PoseTable,
+    spacing_mm: np.ndarray | tuple[float, float] | None = None,
+    minimum: int = MINIMUM_IMAGES,
 ) -> Recording:
     """The recording of a table that has poses and points.
 
@@ -168,6 +170,8 @@ def recording_of(
         table.kind,
         time=table.time,
         spacing_mm=spacing_mm,
+        frame=table.frame,
+        minimum=minimum,
         where=table.name,
     )
     return Recording(images, source=table.name)
@@ -179,6 +183,7 @@ def read_crosswire(
     *,
     spacing_mm: np.ndarray | tuple[float, float] | None = None,
     pose_units: LengthUnit = "mm",
+    minimum: int = MINIMUM_IMAGES,
 ) -> Recording:
     """Read a cross-wire recording: a text file of poses and one of pixels.
 
@@ -188,6 +193,7 @@ def read_crosswire(
         points_path: a row ``u v`` for each image: lateral and axial, px.
         spacing_mm: [lateral, axial] mm per px, when known.
         pose_units: of translations in the file.
+        minimum: least number of images.
 
     Returns:
         Images of kind ``pixel``; rotations are projected to SO(3).
@@ -200,13 +206,15 @@ def read_crosswire(
         :func:`jaxcal.data.recording.make_images`).
     """
     transforms = read_table(transforms_path, header=False, separator="")
-    rows = _fixed(transforms, (4,), "3 rotation numbers and a translation")
+    rows = _fixed(
+        transforms, (4,), "3 rotation numbers and a translation, separated by white space"
+    )
     if len(rows) % 3:
         raise FormatError(
             f"{transforms.row(-1)}: {len(rows)} rows are not whole poses: each takes 3 rows"
         )
     points = read_table(points_path, header=False, separator="")
-    pixels = _fixed(points, (2,), "u and v")
+    pixels = _fixed(points, (2,), "u and v, separated by white space")
     name = f"{transforms.name} with {points.name}"
     if len(rows) // 3 != len(pixels):
         raise FormatError(
@@ -215,16 +223,23 @@ def read_crosswire(
         )
     poses = rows.reshape(-1, 3, 4)
     poses[:, :, 3] *= LENGTHS_MM[pose_units]
-    images = make_images(poses, pixels, "pixel", spacing_mm=spacing_mm, where=name)
+    images = make_images(poses, pixels, "pixel", spacing_mm=spacing_mm, minimum=minimum, where=name)
     return Recording(images, source=name)
 
 
-def read_poses(path: str | os.PathLike[str]) -> Float[np.ndarray, "n 4 4"]:
-    """Read a text file of poses, one a row, separated by white space.
+def read_poses(
+    path: str | os.PathLike[str],
+    *,
+    quaternion: QuaternionOrder = "xyzw",
+    pose_units: LengthUnit = "mm",
+) -> Float[np.ndarray, "n 4 4"]:
+    """Read a table of poses without a header, one a row.
 
     Args:
-        path: rows of 7 numbers, ``x y z qx qy qz qs`` (mm and a unit quaternion, scalar last), or
-            of 12 or 16, the matrix row by row.
+        path: rows of 7 numbers, ``x y z`` and a unit quaternion, or of 12 or 16, the matrix row by
+            row.
+        quaternion: where the scalar stands.
+        pose_units: of translations in the file.
 
     Returns:
         (n, 4, 4), mm; quaternions are normalised, other rotations as they stand.
@@ -233,21 +248,23 @@ def read_poses(path: str | os.PathLike[str]) -> Float[np.ndarray, "n 4 4"]:
         FormatError: a file that cannot be read, a row of another length, something that is not a
             number, or a quaternion whose length is not 1; the file and the line are named.
     """
-    table = read_table(path, header=False, separator="")
+    tabs = first_line(path)[0] == "\t"  # perhaps beside blanks, and at the ends of lines
+    table = read_table(path, header=False, separator="" if tabs else None)
     rows = _fixed(table, (7, 12, 16), "x y z qx qy qz qs, or a matrix row by row", finite=False)
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     if rows.shape[1] != 7:
         matrices = rows.reshape(len(rows), -1, 4)
+        matrices[:, :3, 3] *= LENGTHS_MM[pose_units]
         poses[:, : matrices.shape[1]] = matrices
         return poses
     with naming(path):
         try:
             poses[:, :3, :3] = rotations_from_quaternions(
-                rows[:, 3:], "xyzw", labels=_labels(table.lines)
+                rows[:, 3:], quaternion, labels=_labels(table.lines)
             )
         except InputError as error:
             raise FormatError(str(error)) from None
-    poses[:, :3, 3] = rows[:, :3]
+    poses[:, :3, 3] = rows[:, :3] * LENGTHS_MM[pose_units]
     return poses
 
 
@@ -263,7 +280,7 @@ def _fixed(
     if width not in widths:
         raise FormatError(
             f"{table.row(0)}: {width} columns; {' or '.join(map(str, widths))} are needed "
-            f"({columns}, separated by white space)"
+            f"({columns})"
         )
     return table.numbers(tuple(range(width)), finite=finite)
 

@@ -34,6 +34,7 @@ from jaxcal.report.verdict import (
     advice,
     believe,
     certainty,
+    frames_of_images,
     headline,
     length_form,
     limits,
@@ -432,7 +433,8 @@ def _rounded(values: Any) -> Any:
 
 def _residuals(record: dict[str, Any], answer: Calibration) -> str:
     used = np.flatnonzero(np.asarray(answer.mask) > 0)
-    named = [image for image in outliers(answer) if image in used]
+    suspected = (each["image"] for each in record["suspects"])
+    named = [image for image in (*outliers(answer), *suspected) if image in used]
     residual = np.asarray(answer.residual)[used]
     images = used.astype(float).tolist()
     first = svg.series(
@@ -461,7 +463,7 @@ def _residuals(record: dict[str, Any], answer: Calibration) -> str:
     parts = [
         f"<figure>{first}<figcaption>Residual of every image, one scale for all: the estimated "
         "target less the measured point, taken in the image plane. Rings: images that do not fit "
-        "the rest."
+        "the rest, or are suspicious."
         "</figcaption></figure>",
         f"<figure>{second}<figcaption>Estimated distance of the target from the image plane{spread}"
         ".</figcaption></figure>",
@@ -481,7 +483,7 @@ def _residuals(record: dict[str, Any], answer: Calibration) -> str:
             "left out (to first order). Rings: the three images with the largest effect."
             "</figcaption></figure>"
         )
-    words = _paragraphs(resampled_sentences(record))
+    words = _paragraphs([*frames_of_images(record), *resampled_sentences(record)])
     columns = "".join(f"<div>{part}</div>" for part in parts)
     return _section("Image by image", f'<div class="grid">{columns}</div>', words)
 

@@ -19,7 +19,7 @@ from jaxcal.data.poses import targets_in_images
 from jaxcal.data.recording import Recording
 from jaxcal.diagnostics.influence import KINDS, in_image, influence_of
 from jaxcal.diagnostics.intervals import image_jacobian, tre_at
-from jaxcal.diagnostics.outliers import outliers
+from jaxcal.diagnostics.outliers import outliers, suspects
 from jaxcal.model.image_points import mean_of_squares
 from jaxcal.report.accuracy import error_shares, region_of, scatter_shares
 from jaxcal.report.convergence import Curve
@@ -104,7 +104,8 @@ def plot_residuals(calibration: Calibration) -> Figure:
     residual = np.asarray(answer.residual)
     # A solve that failed has no residuals to draw.
     used = np.flatnonzero((np.asarray(answer.mask) > 0) & np.isfinite(residual).all(axis=1))
-    named = np.intersect1d(outliers(answer), used)
+    suspected = [each["image"] for each in suspects(answer)]
+    named = np.intersect1d([*outliers(answer), *suspected], used)
     figure = canvas(PAGE_MM, 110.0)
     panels = figure.subplots(3, 1, sharex=True, sharey=True)
     for panel, (name, axis) in zip(
@@ -123,7 +124,7 @@ def plot_residuals(calibration: Calibration) -> Figure:
                 mfc="none",
                 mec="black",
                 mew=0.7,
-                label="does not fit the rest",
+                label="does not fit the rest, or suspicious",
             )
         panel.set_ylabel(f"{name} (mm)")
     if len(named):

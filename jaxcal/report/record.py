@@ -100,6 +100,7 @@ def calibration_record(
         "variance_rounds": int(answer.variance_rounds),
         "images": len(answer.mask),
         "images_used": int(result.images_used),
+        "frame": recording.calibration.frame,
         "image_plane_to_probe": answer.image_to_probe,
         "plus_image_to_probe": None if scale is None else transform.plus_matrix(),
         "point_mm": answer.point,

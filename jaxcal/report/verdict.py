@@ -19,6 +19,9 @@ _MOST_MOVED_SHARE = 0.3
 """An image is named if leaving it out moves image points by more than this share of the stated
 error."""
 
+_MOST_FRAMES = 10
+"""Largest number of images whose frames are named."""
+
 _AXES = ("lateral (sideways)", "elevational (out-of-plane)", "axial (depth)")
 _MORE_VARIED = (
     "Add images with the probe tilted by 20 to 30 degrees about each of its three axes, and with "
@@ -44,7 +47,24 @@ def verdict(record: dict[str, Any]) -> list[str]:
         lines += listed("What limits it", limits(record))
         lines += listed("How certain it is", [*certainty(record), *resampled_sentences(record)])
         lines += listed("How the images agree with it", [*scatter(record), *believe(record)])
+        lines += listed("Which images", frames_of_images(record))
     return lines
+
+
+def frames_of_images(record: dict[str, Any]) -> list[str]:
+    """Which frames the images that are named are, if the two are counted differently."""
+    frame = record.get("frame")
+    influence = record.get("influence") or {"most": []}
+    suspected = (each["image"] for each in record["suspects"])
+    named = {*record["outliers"], *suspected, *influence["most"][:3]}
+    told = [] if frame is None else [(k, frame[k]) for k in sorted(named) if frame[k] != k]
+    if not told:
+        return []
+    pairs = ", ".join(f"image {image} is frame {number}" for image, number in told[:_MOST_FRAMES])
+    more = ", ..." if len(told) > _MOST_FRAMES else ""
+    return [
+        f"Images are counted from 0 in the recording; in the file that it came from, {pairs}{more}."
+    ]
 
 
 def headline(record: dict[str, Any]) -> str:

@@ -22,6 +22,7 @@ from jaxcal.report.convergence import Curve
 from jaxcal.report.verdict import verdict
 from jaxcal.result.calibration import Calibration
 from jaxcal.result.saved import is_calibration_record
+from jaxcal.runtime.array_types import Int
 
 COLUMNS = (
     "image",
@@ -32,8 +33,10 @@ COLUMNS = (
     "elevation_mm",
     "elevation_sd_mm",
     "at_bound",
+    "frame",
 )
-"""Columns of residuals.csv: the residual from the image plane, then the estimated offset."""
+"""Columns of residuals.csv: the residual from the image plane, the estimated offset, and the number
+of the frame in the file that was imported."""
 
 FIGURES = ("residuals", "offsets", "accuracy", "influence", "limits", "convergence")
 NAMES = (
@@ -137,7 +140,7 @@ def write_report(
     texts = {
         "calibration.json": _json(record),
         "verdict.txt": "\n".join(verdict(record)) + "\n",
-        "residuals.csv": _residual_table(result),
+        "residuals.csv": _residual_table(result, recording.calibration.frame),
     }
     if comparison is not None:
         texts["comparison.json"] = _json(comparison)
@@ -165,7 +168,7 @@ def write_json(path: str | os.PathLike[str], record: dict[str, Any]) -> None:
     write_text(path, _json(record))
 
 
-def _residual_table(result: Calibration) -> str:
+def _residual_table(result: Calibration, frame: Int[np.ndarray, " n"] | None) -> str:
     answer = result.numpy()
     table = io.StringIO()
     rows = csv.writer(table, lineterminator="\n")
@@ -174,7 +177,8 @@ def _residual_table(result: Calibration) -> str:
         used = bool(answer.mask[image] > 0)
         numbers = [*answer.residual[image], answer.elevation[image], answer.elevation_sd[image]]
         cells = [_cell(value) if used else "" for value in numbers]
-        rows.writerow([image, int(used), *cells, int(answer.at_bound[image] > 0)])
+        number = "" if frame is None else int(frame[image])
+        rows.writerow([image, int(used), *cells, int(answer.at_bound[image] > 0), number])
     return table.getvalue()
 
 

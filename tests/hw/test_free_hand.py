@@ -471,7 +471,7 @@ def test_advice_names_what_is_missing():
     assert "bring the target to the lower right" in few.advice((300, 300))
     assert "turn the probe more (its orientations differ by 0 degrees)" in few.advice((300, 300))
     one_axis = guide([[0.1 * k - 0.4, 0, 0] for k in range(9)], everywhere)
-    assert one_axis.advice((300, 300)).startswith("turn it about another axis")
+    assert one_axis.advice((300, 300)).startswith("turn the probe about another axis")
     good = guide(rng.normal(0, 0.5, (9, 3)), everywhere)
     assert good.advice((300, 300)) == "well covered: any other pose helps"
     sds = orientation_sds(np.array([each.pose for each in one_axis.taken]))
