@@ -257,8 +257,9 @@ class TrackedSequence:
             PixelStream(pixels.path, pixels.start, pixels.packing, size * len(self)) as stream,
         ):
             for number in numbers:
-                content = stream.read_at(number * size, size)
-                yield _oriented(_grey(content, pixels), stored)
+                frame = np.frombuffer(stream.read_at(number * size, size), pixels.dtype)
+                frame = frame.reshape(pixels.rows, pixels.columns, pixels.channels)
+                yield _oriented(grey_of(frame), stored)
             stream.check_end()
 
 
@@ -284,11 +285,6 @@ def _png_image(pixels: FolderPixels, number: int) -> np.ndarray:
     if frame.shape != (pixels.rows, pixels.columns):
         raise FormatError(f"{pixels.paths[number]}: has changed its size while it was being read")
     return frame
-
-
-def _grey(content: bytes, pixels: Pixels) -> np.ndarray:
-    frame = np.frombuffer(content, pixels.dtype)
-    return grey_of(frame.reshape(pixels.rows, pixels.columns, pixels.channels))
 
 
 def _oriented(frame: np.ndarray, stored: str) -> np.ndarray:
