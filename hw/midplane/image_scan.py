@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Literal, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -22,10 +22,8 @@ from hw.midplane.bracket import Placement
 from hw.midplane.search import Echoes, Settings
 from jaxcal.data.segmentation.image import localise
 from jaxcal.data.segmentation.speckle import SMALLEST_REGION, NotFoundError, envelope_of
-from jaxcal.data.segmentation.spot import brightest
+from jaxcal.data.segmentation.spot import Target, brightest
 from jaxcal.runtime.array_types import Float, UInt8
-
-Target = Literal["echo", "cross"]
 
 LINES = 16
 """Number of lines that are given this intensity; more than the procedures need to be answered."""
