@@ -30,9 +30,7 @@ METHODS: dict[str, dict] = {
 
 @pytest.fixture(scope="module")
 def problems() -> list[jaxcal.Problem]:
-    return [
-        simulated(seed, images=12, elevation_mm=2.0, noise_mm=0.5, test_images=4) for seed in (1, 2)
-    ]
+    return [simulated(seed, images=12, elevation_mm=2.0, noise_mm=0.5) for seed in (1, 2)]
 
 
 def test_buckets_grow_by_a_half_or_a_third():
@@ -118,7 +116,7 @@ def test_masked_images_beyond_the_bucket_change_nothing(name, problems):
 
     The conventional method is compared with the problem without padding below.
     """
-    smaller = simulated(3, images=8, elevation_mm=2.0, noise_mm=0.5, test_images=4)
+    smaller = simulated(3, images=8, elevation_mm=2.0, noise_mm=0.5)
     sources = [
         *problems,
         jax.tree.map(jnp.asarray, taken(smaller, [*range(8), 0])),
