@@ -22,7 +22,7 @@ from hw.midplane.bracket import Placement
 from hw.midplane.search import Echoes, Settings
 from jaxcal.data.segmentation.image import localise
 from jaxcal.data.segmentation.speckle import SMALLEST_REGION, NotFoundError, envelope_of
-from jaxcal.data.segmentation.spot import Target, brightest
+from jaxcal.data.segmentation.spot import brightest
 from jaxcal.runtime.array_types import Float, UInt8
 
 LINES = 16
@@ -55,7 +55,6 @@ class ImageBench:
         see: the next whole frame that began after the last move.
         expected_px: [u, v] where the target should be.
         within_px: look no farther from there.
-        target: ``echo`` or ``cross``.
         credible: answer only where :func:`jaxcal.data.segmentation.image.localise` finds the
             target; it takes longer than the brightest place.
     """
@@ -66,13 +65,11 @@ class ImageBench:
         see: Callable[[], UInt8[np.ndarray, "rows columns"]],
         expected_px: tuple[float, float],
         within_px: float,
-        target: Target = "cross",
         *,
         credible: bool = False,
     ) -> None:
         self._mover, self._see = mover, see
         self._expected, self._within = expected_px, within_px
-        self._target: Target = target
         self._credible = credible
 
     def move(self, offset_mm: float) -> float:
@@ -90,7 +87,7 @@ class ImageBench:
 
     def _intensity(self, frame: np.ndarray) -> float:
         if self._credible:
-            found = localise(frame, self._target, near=self._expected, within_px=self._within)
+            found = localise(frame, "cross", near=self._expected, within_px=self._within)
             if not found.found[0]:
                 return 0.0
         return brightest_intensity(frame, self._expected, self._within)
