@@ -18,7 +18,7 @@ from hw.bench.frames import DEPTH_MM, Camera
 from hw.bench.look import Look
 from hw.bench.world import World, make_world
 from hw.runtime.choices import PHANTOMS
-from hw.runtime.rigid import rotation_matrix
+from jaxcal.data.poses import rotations_from_vectors
 from jaxcal.data.segmentation.image import Target, localise
 
 PICTURE = Path(__file__).parents[1] / "docs" / "images" / "phantoms.png"
@@ -39,7 +39,7 @@ def placed(world: World, elevation_mm: float) -> np.ndarray:
     """A pose of the probe, turned a little, that has the target at its place in the image."""
     pose = np.eye(4)
     x = world.image_to_probe
-    pose[:3, :3] = np.diag([1.0, -1.0, -1.0]) @ rotation_matrix(np.array([0.2, 0.1, 0.3]))
+    pose[:3, :3] = np.diag([1.0, -1.0, -1.0]) @ rotations_from_vectors(np.array([0.2, 0.1, 0.3]))
     pose[:3, :3] = pose[:3, :3] @ x[:3, :3].T
     axial = float(np.sqrt(RANGE_MM**2 - elevation_mm**2))
     place = x[:3, :3] @ [LATERAL_MM, elevation_mm, axial] + x[:3, 3]

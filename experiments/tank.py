@@ -24,8 +24,9 @@ from hw.bench.tank import ELEMENT_MM, Beam, Noise
 from hw.bench.world import DRAWN, TANK_MM
 from hw.planning.poses import Extent, plan_poses
 from hw.planning.scene import Scene
-from hw.runtime.rigid import looking_rotation, rotation_matrix
+from hw.runtime.rigid import looking_rotation
 from jaxcal import Images, segment
+from jaxcal.data.poses import rotations_from_vectors
 from jaxcal.data.probe import L14_5
 from jaxcal.data.segmentation.segment import Method
 
@@ -289,7 +290,7 @@ def _draw_one(
     n = tank.images
     off = rng.uniform(-1, 1, size=(2, 3))
     x = DRAWN.copy()
-    x[:3, :3] = DRAWN[:3, :3] @ rotation_matrix(np.radians(1.5) * off[0])
+    x[:3, :3] = DRAWN[:3, :3] @ rotations_from_vectors(np.radians(1.5) * off[0])
     x[:3, 3] += 2.0 * off[1]
     shared = pose_errors(tank, plan.rotations, rng)
     speed = 1.0 + tank.speed_m_s * rng.normal() / 1490.0
@@ -375,7 +376,7 @@ def exact_images(x: np.ndarray, rng: np.random.Generator, count: int = 50) -> _O
     axis *= (np.radians(30.0) * rng.random(count) / np.linalg.norm(axis, axis=1))[:, None]
     poses = np.tile(np.eye(4), (count, 1, 1))
     for pose, turn, (lateral, axial) in zip(poses, axis, points, strict=True):
-        pose[:3, :3] = np.diag([1.0, -1.0, -1.0]) @ rotation_matrix(turn) @ DRAWN[:3, :3].T
+        pose[:3, :3] = np.diag([1.0, -1.0, -1.0]) @ rotations_from_vectors(turn) @ DRAWN[:3, :3].T
         place = x[:3, :3] @ [lateral, 0.0, axial] + x[:3, 3]
         pose[:3, 3] = TANK_MM - pose[:3, :3] @ place
     return poses, points, np.zeros(count)

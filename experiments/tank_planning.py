@@ -38,8 +38,8 @@ from tank_run import Run
 from tank_sds import FACTOR, GAIN_SD, from_amplitude, own_sds
 
 from hw.bench.world import DRAWN, TANK_MM
-from hw.runtime.rigid import rotation_matrix
 from jaxcal import calibrate_batch
+from jaxcal.data.poses import rotations_from_vectors
 from jaxcal.study import ArraySpec, Chunk
 
 BY_EYE = "by eye, cross-wire"
@@ -165,7 +165,7 @@ def one(session: Session, seed: int, trial: int) -> Shots:
     plan = orientations(n, tank.cone_deg, tank.turn_deg, trial % 32)
     off = rng.uniform(-1, 1, size=(2, 3))
     x = DRAWN.copy()
-    x[:3, :3] = DRAWN[:3, :3] @ rotation_matrix(np.radians(1.5) * off[0])
+    x[:3, :3] = DRAWN[:3, :3] @ rotations_from_vectors(np.radians(1.5) * off[0])
     x[:3, 3] += 2.0 * off[1]
     tests, test_points, _ = exact_images(x, rng)
     shared = pose_errors(tank, plan.rotations, rng)

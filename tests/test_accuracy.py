@@ -497,7 +497,7 @@ def test_test_images_that_scatter_contradict_the_error(record):
 
 
 def test_precision_is_that_at_the_estimated_sound_speed_and_delay():
-    recording = experiment(3, images=24, elevation_mm=1.0, test_images=6)
+    recording = experiment(3, images=24, elevation_mm=1.0)
     result = jaxcal.calibrate(recording, "conventional").numpy()
     assert result.problem is not None
     assert recording.test is not None

@@ -137,7 +137,7 @@ def test_range_errors_are_judged_by_those_at_their_place():
 
 
 def test_an_image_whose_range_is_off_is_a_suspect():
-    data = problem(3, images=60, elevation_mm=1.0, noise_mm=1.0)
+    data = problem(3, images=50, elevation_mm=1.0, noise_mm=1.0)
     clean = jaxcal.calibrate(data, "conventional")
     assert suspects(clean) == []
     # In the middle of the image, where errors are small.

@@ -447,7 +447,9 @@ def test_unwritable_folder(tmp_path, capsys):
     path, occupied = tmp_path / "spec.toml", tmp_path / "file"
     path.write_text(small())
     occupied.write_text("mine")
-    places = [occupied, occupied / "below", Path("/proc/study")]
+    assert main(["study", "run", str(path), "--out", str(occupied)]) == 2
+    assert f"{occupied}: is a file, not a folder\n" in capsys.readouterr().err
+    places = [occupied / "below", Path("/proc/study")]
     if os.geteuid() != 0:
         locked = tmp_path / "locked"
         locked.mkdir(mode=0o500)

@@ -15,6 +15,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from string import hexdigits
 from typing import Literal
 
 import numpy as np
@@ -35,6 +36,7 @@ from hw.runtime.clock import REAL, Clock
 Echo = Callable[[float, int], tuple[np.ndarray, np.ndarray]]
 """(time s, threshold) -> time of flight (lines,) s with NaN for no response, amplitude (lines,)."""
 
+_DIGITS = frozenset(hexdigits)
 _LARGEST_SLIP_S = 0.25
 _LONGEST_COMMAND = 2 * MAXIMUM_LINES + 64
 
@@ -301,7 +303,9 @@ class AuspisEmulator:
             case "INJ:DEL" if _within(argument, 0xFFFF):
                 self.injection = replace(self.injection, delay_ticks=int(argument))
                 return argument
-            case "PATT:LOAD" if len(argument) == 2 * self._lines and _hexadecimal(argument):
+            case "PATT:LOAD" if len(argument) == 2 * self._lines and set(argument) <= set(
+                hexdigits
+            ):
                 pattern = bytes.fromhex(argument)
                 self.injection = replace(self.injection, pattern=pattern)
                 return f"{zlib.crc32(pattern):08x}"
@@ -325,7 +329,3 @@ def to_ticks(seconds: np.ndarray, clock_hz: float) -> np.ndarray:
 
 def _within(text: str, largest: int) -> bool:
     return text.isdecimal() and text.isascii() and len(text) < 6 and int(text) <= largest
-
-
-def _hexadecimal(text: str) -> bool:
-    return all(digit in "0123456789abcdefABCDEF" for digit in text)

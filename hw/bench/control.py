@@ -18,6 +18,8 @@ from typing import Any
 
 LONGEST_LINE = 1 << 20
 _MOST_CONNECTIONS = 8
+_TIMEOUT_S = 30.0
+"""Wall seconds for connecting and for an answer."""
 
 Handler = Callable[[dict], object]
 
@@ -88,14 +90,13 @@ class ControlClient:
 
     Args:
         port: of its control socket on loopback.
-        timeout_s: wall seconds for connecting and for an answer.
 
     Raises:
         OSError: no bench listens there.
     """
 
-    def __init__(self, port: int, timeout_s: float = 30.0) -> None:
-        self._socket = socket.create_connection(("127.0.0.1", port), timeout=timeout_s)
+    def __init__(self, port: int) -> None:
+        self._socket = socket.create_connection(("127.0.0.1", port), timeout=_TIMEOUT_S)
         self._stream = self._socket.makefile("rwb")
         self._lock = threading.Lock()
 

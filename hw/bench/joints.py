@@ -25,7 +25,8 @@ from hw.robot.kinematics import (
     nearest_turn,
 )
 from hw.robot.pose import ur_to_pose
-from hw.runtime.rigid import quaternion_to_matrix, rigid
+from hw.runtime.rigid import rigid
+from jaxcal.data.poses import rotations_from_quaternions
 from jaxcal.runtime.array_types import Float
 
 LEAST_DEXTERITY_MM = 1.0
@@ -111,7 +112,7 @@ def track(
         return JointTrack(motion, np.zeros(1), start[None], math.inf)
     parts = np.linspace(0.0, 1.0, min(2 + math.ceil(length / _SPACING_MM), _MOST_SAMPLES))
     way = rigid(parts[:, None] * turn, 1000 * (np.array(motion.position) + parts[:, None] * travel))
-    way[:, :3, :3] = way[:, :3, :3] @ quaternion_to_matrix(np.array(motion.quaternion))
+    way[:, :3, :3] @= rotations_from_quaternions(np.array([motion.quaternion]), "wxyz")[0]
     found = inverse(model, flange_of(way, tcp_offset), joint_6=float(start[5]))
     branch = int(branch_of(model, start))
     good, joints = found.reached[:, branch], found.joints[:, branch]

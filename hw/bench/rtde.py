@@ -201,12 +201,11 @@ class RtdeServer:
                 self._selector.register(connection.socket, selectors.EVENT_READ, connection)
 
     @_in_the_loop
-    def drop(self, *, reset: bool = True, control_only: bool = False) -> None:
-        """Close all clients' connections, or only those that command: reset, or closed in order."""
+    def drop(self, *, control_only: bool = False) -> None:
+        """Reset all clients' connections, or only those that command."""
         for connection in [c for c in self._connections if c.inputs or not control_only]:
-            if reset:
-                linger = struct.pack("ii", 1, 0)
-                connection.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, linger)
+            linger = struct.pack("ii", 1, 0)
+            connection.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, linger)
             self._forget(connection)
 
     @_in_the_loop

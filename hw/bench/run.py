@@ -17,6 +17,7 @@ import sys
 import tempfile
 import threading
 from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 
@@ -150,20 +151,19 @@ class Bench:
             self._process.stdout.close()
 
 
-def start_bench(options: BenchOptions | None = None, **changes) -> Bench:
+def start_bench(**options: Any) -> Bench:
     """Start a bench in a process of its own.
 
     Args:
-        options: how to run it.
-        changes: fields of :class:`BenchOptions` that replace those of ``options``.
+        options: fields of :class:`BenchOptions`.
 
     Raises:
         InputError: invalid options, or a bench that does not start; one line.
     """
-    options = BenchOptions(**{**(asdict(options) if options is not None else {}), **changes})
+    chosen = BenchOptions(**options)
     with tempfile.TemporaryFile() as complaints:
         process = subprocess.Popen(
-            python_command("hw.bench.run", "--json", json.dumps(asdict(options))),
+            python_command("hw.bench.run", "--json", json.dumps(asdict(chosen))),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=complaints,

@@ -24,6 +24,10 @@ _MOST_CLIENTS = 8
 _MOST_PENDING = 16 << 20
 _SEND_BUFFER = 1 << 20
 _LARGEST_SLIP_S = 0.25
+_DEVICE = "Image"
+"""Name under which the images are sent."""
+_CLOCK_AHEAD_S = 1_000_000.0
+"""Time of the machine's own clock less bench time."""
 
 
 @dataclass(frozen=True)
@@ -49,18 +53,15 @@ class ImageServer:
         render: time s -> (height, width) uint8 image; called from the server's thread.
         clock: of the bench.
         rate_hz: images per second of the bench's time.
-        port: 0: any that is free.
-        host: loopback address.
         spacing_mm: [lateral, axial] mm per pixel.
-        device: name under which the images are sent.
         rf: time s -> (samples, lines) int16, sent after each image as an image of device ``RF``.
         transforms: time s -> {name: (4, 4) mm}, sent before each image: one as TRANSFORM, more of
             them as one TDATA.
-        device_clock: bench time s -> time stamp s of the machine's own clock.
         seed: of the faults that come by chance.
 
     Attributes:
-        port: to connect to.
+        host: loopback address to connect to.
+        port: of it.
         sent: images made for the clients.
         refused: images dropped for clients that were too slow.
     """
@@ -71,29 +72,24 @@ class ImageServer:
         *,
         clock: Clock = REAL,
         rate_hz: float = 30.0,
-        port: int = 0,
-        host: str = "127.0.0.1",
         spacing_mm: tuple[float, float] = (0.1, 0.1),
-        device: str = "Image",
         rf: Callable[[float], np.ndarray] | None = None,
         transforms: Callable[[float], Mapping[str, np.ndarray]] | None = None,
-        device_clock: Callable[[float], float] = lambda t: 1_000_000.0 + t,
         seed: int = 0,
     ) -> None:
         self._render, self._rf, self._transforms = render, rf, transforms
-        self._clock, self._period_s, self._device_clock = clock, 1.0 / rate_hz, device_clock
-        self._spacing, self._device = spacing_mm, device
+        self._clock, self._period_s, self._spacing = clock, 1.0 / rate_hz, spacing_mm
         self._random = np.random.default_rng(seed)
         self._faults = _Faults()
         self._stopping = self._dropping = False
         self._clients: dict[int, _Client] = {}
         self._selector = selectors.DefaultSelector()
-        self._listener = socket.create_server((host, port), backlog=_MOST_CLIENTS)
+        self._listener = socket.create_server(("127.0.0.1", 0), backlog=_MOST_CLIENTS)
         self._listener.setblocking(False)
         self._selector.register(self._listener, selectors.EVENT_READ)
         self._thread = threading.Thread(target=self._run, name="emulated ultrasound", daemon=True)
         self._image: Message | None = None
-        self.host, self.port = host, int(self._listener.getsockname()[1])
+        self.host, self.port = self._listener.getsockname()
         self.sent = self.refused = 0
         self._numbers: dict[tuple[str, str], int] = {}
 
@@ -176,7 +172,7 @@ class ImageServer:
             self._broadcast([encode(self._message(kind, device, t, content))])
         if self._image is None or not self._faults.frozen:
             picture = Picture(np.ascontiguousarray(self._render(t)), self._spacing)
-            self._image = self._message("IMAGE", self._device, t, picture)
+            self._image = self._message("IMAGE", _DEVICE, t, picture)
         data = encode(self._image)
         if self._random.random() < self._faults.corrupt:
             data = self._spoil(data)
@@ -190,7 +186,7 @@ class ImageServer:
     def _message(self, kind: str, device: str, t: float, content: Content) -> Message:
         number = self._numbers.get((kind, device), 0) + 1
         self._numbers[kind, device] = number
-        return Message(kind, device, self._device_clock(t), content, message_id=number)
+        return Message(kind, device, _CLOCK_AHEAD_S + t, content, message_id=number)
 
     def _spoil(self, data: bytes) -> bytes:
         spoilt = bytearray(data)
@@ -226,7 +222,7 @@ class ImageServer:
         self._clients[connection.fileno()] = client
         self._selector.register(connection, selectors.EVENT_READ)
         hello = self._message(
-            "STATUS", self._device, self._clock.now(), StatusMessage(1, 0, "", "ready")
+            "STATUS", _DEVICE, self._clock.now(), StatusMessage(1, 0, "", "ready")
         )
         client.pending.append(memoryview(encode(hello)))
         client.size += len(client.pending[-1])

@@ -30,8 +30,9 @@ import numpy as np
 from hw.bench.phantoms import ActiveEcho, Phantom, phantom_named
 from hw.bench.tank import ELEMENT_MM, Beam, Noise, Pose, Tank
 from hw.planning.scene import Scene
-from hw.runtime.rigid import looking_rotation, rigid, rotation_matrix
+from hw.runtime.rigid import looking_rotation, rigid
 from jaxcal import InputError
+from jaxcal.data.poses import rotations_from_vectors
 from jaxcal.runtime.array_types import Bool, Float
 
 FULL_SCALE = 4095
@@ -118,7 +119,7 @@ class World(Tank):
         for pose, (lateral, depth) in zip(poses, points, strict=True):
             axis = rng.normal(size=3)
             turn = axis / np.linalg.norm(axis) * np.radians(30.0) * rng.random()
-            pose[:3, :3] = looking @ rotation_matrix(turn) @ self.image_to_probe[:3, :3].T
+            pose[:3, :3] = looking @ rotations_from_vectors(turn) @ self.image_to_probe[:3, :3].T
             place = self.image_to_probe[:3, :3] @ [lateral, 0.0, depth] + self.image_to_probe[:3, 3]
             pose[:3, 3] = self.point_mm - pose[:3, :3] @ place
         return poses, points

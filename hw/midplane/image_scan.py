@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Literal, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -24,8 +24,6 @@ from jaxcal.data.segmentation.image import localise
 from jaxcal.data.segmentation.speckle import SMALLEST_REGION, NotFoundError, envelope_of
 from jaxcal.data.segmentation.spot import brightest
 from jaxcal.runtime.array_types import Float, UInt8
-
-Target = Literal["echo", "cross"]
 
 LINES = 16
 """Number of lines that are given this intensity; more than the procedures need to be answered."""
@@ -57,7 +55,6 @@ class ImageBench:
         see: the next whole frame that began after the last move.
         expected_px: [u, v] where the target should be.
         within_px: look no farther from there.
-        target: ``echo`` or ``cross``.
         credible: answer only where :func:`jaxcal.data.segmentation.image.localise` finds the
             target; it takes longer than the brightest place.
     """
@@ -68,13 +65,11 @@ class ImageBench:
         see: Callable[[], UInt8[np.ndarray, "rows columns"]],
         expected_px: tuple[float, float],
         within_px: float,
-        target: Target = "cross",
         *,
         credible: bool = False,
     ) -> None:
         self._mover, self._see = mover, see
         self._expected, self._within = expected_px, within_px
-        self._target: Target = target
         self._credible = credible
 
     def move(self, offset_mm: float) -> float:
@@ -92,7 +87,7 @@ class ImageBench:
 
     def _intensity(self, frame: np.ndarray) -> float:
         if self._credible:
-            found = localise(frame, self._target, near=self._expected, within_px=self._within)
+            found = localise(frame, "cross", near=self._expected, within_px=self._within)
             if not found.found[0]:
                 return 0.0
         return brightest_intensity(frame, self._expected, self._within)

@@ -32,6 +32,10 @@ _MOST_LOOKS = 150
 _VISIBLE_DROP = 4
 _LEAST_SHORT = 2
 _SAME_PLACE_MM = 0.05
+_SWEEP_MM = 0.25
+"""Step of the operator who follows the instructions by rule."""
+_DELAY_TICKS = 400
+"""How long after the echo the bar is sent, ticks of the device's clock."""
 # The bar's scale begins at this part of the maximum, so that a few per cent near it can be seen.
 _SCALE_FROM = 0.4
 
@@ -128,14 +132,9 @@ Operator = Callable[[View], Decision]
 
 
 class SteadyOperator:
-    """Does what the instructions say: sweep up through the longest bar, then back to the middle.
+    """Does what the instructions say: sweep up through the longest bar, then back to the middle."""
 
-    Args:
-        step_mm: of the sweep.
-    """
-
-    def __init__(self, step_mm: float = 0.25) -> None:
-        self._step = step_mm
+    def __init__(self) -> None:
         self._stage: Literal["down", "up", "check"] = "down"
         self._from = 0
 
@@ -143,7 +142,7 @@ class SteadyOperator:
         """Decide."""
         if self._stage == "down":
             if view.length > max(view.longest - 2 * _VISIBLE_DROP, 0):
-                return Decision("go", view.offset_mm - 4 * self._step)
+                return Decision("go", view.offset_mm - 4 * _SWEEP_MM)
             self._stage, self._from = "up", len(view.seen) - 1
         if self._stage == "check" and view.message:
             self._stage, self._from = "up", len(view.seen) - 1
@@ -155,7 +154,7 @@ class SteadyOperator:
                 length <= longest - 2 * _VISIBLE_DROP for _, length in sweep[-2:]
             )
             if not (passed and longest >= view.longest - _VISIBLE_DROP):
-                return Decision("go", view.offset_mm + self._step)
+                return Decision("go", view.offset_mm + _SWEEP_MM)
             self._stage = "check"
             return Decision("go", middle_of(sweep))
         return Decision("accept")
@@ -226,7 +225,6 @@ def pattern_injection(
     *,
     frame: Callable[[], Frame | None] = _no_frame,
     title: str = "",
-    delay_ticks: int = 400,
     watch: Callable[[float, float, int], None] | None = None,
 ) -> Placement:
     """Let an operator find the mid-plane by the injected bar.
@@ -240,7 +238,6 @@ def pattern_injection(
         start_mm: where the mid-plane is expected, as an offset from the plan's pose.
         frame: gives the newest B-mode frame for the view.
         title: which pose this is, for the view.
-        delay_ticks: how long after the echo the bar is sent, clock ticks.
         watch: told of every stop.
 
     Returns:
@@ -266,7 +263,7 @@ def pattern_injection(
             seen = [(at, bar_length(amplitude, loudest)) for at, amplitude in heard]
             lines = echoes.amplitude.shape[1]
             injector.load_pattern(bar(seen[-1][1], echoes.loudest_line, lines))
-            injector.inject(True, delay_ticks)
+            injector.inject(True, _DELAY_TICKS)
             decision = operator(
                 View(
                     seen[-1][1],

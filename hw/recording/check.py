@@ -8,9 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-import h5py
 import numpy as np
-from h5py import h5d  # pyright: ignore[reportAttributeAccessIssue]
 
 from hw.recording.layout import (
     FORMAT,
@@ -25,6 +23,7 @@ from hw.recording.layout import (
 from jaxcal import FormatError, InputError
 from jaxcal.data.poses import check_poses
 from jaxcal.io.given_files import check_readable, naming
+from jaxcal.io.lines import HDF5_BEGINNING
 from jaxcal.io.untrusted import (
     Node,
     UpTo,
@@ -36,6 +35,7 @@ from jaxcal.io.untrusted import (
     members,
     number,
     open_root,
+    stored_here,
     text,
 )
 
@@ -72,7 +72,7 @@ def check_resumable(path: str | os.PathLike[str]) -> None:
             if node is not None:
                 check_attributes(node)
                 for member in members(node, _MOST_MEMBERS):
-                    _check_place(member)
+                    stored_here(member)
                     check_attributes(member)
 
 
@@ -254,14 +254,14 @@ def stored_length(path: str | os.PathLike[str]) -> int | None:
     """
     with open(path, "rb") as file:
         start = file.read(48)
-    if start[:9] != b"\x89HDF\r\n\x1a\n\0":
+    if start[:9] != HDF5_BEGINNING + b"\0":
         return None
     length = int.from_bytes(start[40:48], "little")
     return length if 0 < length - os.path.getsize(path) <= LARGEST_ROW else None
 
 
 def _check_column(node: Node, column: Column) -> None:
-    dataset = _check_place(node)
+    dataset, _ = stored_here(node)
     wanted = (len(column.tail) + 1, FRAME_TYPES if column.dtype == "frame" else (column.dtype,))
     names = (dataset.dtype.name, dataset.dtype.str[1:])
     if dataset.ndim != wanted[0] or not set(names) & {np.dtype(d).str[1:] for d in wanted[1]}:
@@ -270,13 +270,3 @@ def _check_column(node: Node, column: Column) -> None:
         raise FormatError(f"{node} cannot grow")
     if int(np.prod(dataset.shape[1:], dtype=object)) * dataset.dtype.itemsize > LARGEST_ROW:
         raise FormatError(f"{node} claims rows of shape {dataset.shape[1:]}")
-
-
-def _check_place(node: Node) -> h5py.Dataset:
-    """The dataset, which holds its data itself."""
-    if not isinstance(node.item, h5py.Dataset):
-        raise FormatError(f"{node} must be a dataset")
-    layout = node.item.id.get_create_plist()
-    if layout.get_layout() == h5d.VIRTUAL or layout.get_external_count():
-        raise FormatError(f"{node} is stored in another file: recordings must hold their data")
-    return node.item

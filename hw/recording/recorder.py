@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from hw.active_echo.device import EchoFrame
     from hw.robot.stream import PoseSample
     from hw.ultrasound.receiver import Image
+    from jaxcal.data.timing import ClockFit
 
 QUEUE_BYTES = 2**26
 """What may wait to be written: 64 MiB, seven seconds of frames of 640 x 480 at 30 a second."""
@@ -181,24 +182,16 @@ class Recorder:
             text=whole[:TEXT_BYTES].decode(errors="ignore").encode(),
         )
 
-    def add_clock(
-        self,
-        device: str,
-        offset: float,
-        drift: float,
-        reference: float,
-        residual: float,
-        t_host: float,
-    ) -> None:
-        """Append the fit of a device's clock (see the layout for its meaning)."""
+    def add_clock(self, device: str, fit: ClockFit, t_host: float) -> None:
+        """Append the fit of a device's clock, with its median delay as the residual."""
         self._row(
             "clock",
             t_host=t_host,
             device=device.encode()[:32],
-            offset=offset,
-            drift=drift,
-            reference=reference,
-            residual=residual,
+            offset=fit.offset_s,
+            drift=fit.drift,
+            reference=fit.reference_s,
+            residual=float(np.median(fit.delay_s)),
         )
 
     def add_selected(

@@ -394,11 +394,8 @@ class Session:
             if len(pairs) < _LEAST_STAMPS or (np.diff(pairs[:, 0]) <= 0).any():
                 continue
             fit = fit_clock(pairs[:, 0], pairs[:, 1])
-            residual = float(np.median(fit.delay_s))
             with suppress(CalibrationError):
-                self._recorder.add_clock(
-                    device, fit.offset_s, fit.drift, fit.reference_s, residual, now
-                )
+                self._recorder.add_clock(device, fit, now)
 
 
 def frame_period(frames: Sequence[EchoFrame], clock_hz: float) -> float | None:

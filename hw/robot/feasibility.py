@@ -38,7 +38,7 @@ from hw.robot.kinematics import (
     tool_of,
 )
 from hw.runtime.errors import RefusedError, refused
-from hw.runtime.rigid import cross_matrix, rotation_vector, straight_way
+from hw.runtime.rigid import rotation_vector, straight_way
 from jaxcal.runtime.array_types import Float
 
 _COARSE_MM = 20.0
@@ -166,7 +166,7 @@ def follow(
         if not moving:
             break
         offsets = way[:, :3, :3] @ -(tool_of(arm.tcp_offset)[:3, :3].T @ lever)
-        velocity = travel + offsets @ cross_matrix(turn).T
+        velocity = travel + np.cross(turn, offsets)
         twist = np.concatenate([velocity, np.tile(turn * ANGLE_MM, (count, 1))], axis=1)
         rates = np.linalg.solve(matrix, twist[..., None])[..., 0]
         half = 0.5 / max(count - 1, 1)

@@ -34,8 +34,8 @@ from functools import cached_property
 import numpy as np
 
 from hw.runtime.errors import refused
-from hw.runtime.rigid import inverse as inverse_transform
 from hw.runtime.rigid import rigid
+from jaxcal.data.poses import inverse_poses
 from jaxcal.runtime.array_types import Bool, Float, Int
 
 ANGLE_MM = 100.0
@@ -388,7 +388,7 @@ def flange_of(
     pose: Float[np.ndarray, "*n 4 4"], tcp_offset: tuple[float, ...]
 ) -> Float[np.ndarray, "*n 4 4"]:
     """Pose of the flange from that of the TCP (mm); ``tcp_offset`` is the controller's (m, rad)."""
-    return pose @ inverse_transform(tool_of(tcp_offset))
+    return pose @ inverse_poses(tool_of(tcp_offset))
 
 
 def tool_of(tcp_offset: tuple[float, ...]) -> Float[np.ndarray, "4 4"]:

@@ -18,7 +18,8 @@ from hw.robot.kinematics import tool_of
 from hw.robot.limits import Limits
 from hw.robot.motion_plan import MotionPlan, array_of
 from hw.runtime.errors import refused
-from hw.runtime.rigid import inverse, straight_way, turn_deg
+from hw.runtime.rigid import straight_way, turn_deg
+from jaxcal.data.poses import inverse_poses
 
 _ROTATION_TOLERANCE = 1e-6
 _POSITION_TOLERANCE_MM = 1e-6
@@ -94,7 +95,7 @@ def check_path(
     probe = _probe_points(limits)
     names = ["the probe's tip"] + ["a corner of the probe"] * len(limits.hull_mm)
     _check_box(way, spread, probe, names, limits.box_min_mm, limits.box_max_mm, f"{what} takes", "")
-    flange = inverse(tool_of(plan.tcp_offset))[:3, 3]
+    flange = inverse_poses(tool_of(plan.tcp_offset))[:3, 3]
     _check_box(
         way,
         spread,

@@ -35,6 +35,8 @@ from hw.runtime.rigid import rotation_vector
 from jaxcal.runtime.array_types import Float
 
 _OFFSET_TOLERANCE = 1e-6
+_MOST_POSES = 60_000
+"""Most poses kept for :meth:`PoseStream.drain`; beyond it the oldest are dropped, and counted."""
 
 
 @dataclass(frozen=True)
@@ -91,8 +93,6 @@ class PoseStream:
         clock: bench time.
         frequency_hz: poses per second; by default all the controller makes.
         max_age_s: bench seconds after which :meth:`latest` refuses a pose.
-        queue: most poses kept for :meth:`drain`; beyond it the oldest are dropped, and counted in
-            ``dropped``.
         client: ``packets`` reads every packet; ``ur_rtde`` goes through that library, which keeps
             only the newest and so loses some on a busy machine.
         timeout_s: wall seconds for the connection, and of silence before it counts as lost.
@@ -105,7 +105,6 @@ class PoseStream:
         clock: Clock = REAL,
         frequency_hz: float | None = None,
         max_age_s: float = 0.1,
-        queue: int = 60_000,
         client: Literal["packets", "ur_rtde"] = "packets",
         timeout_s: float = 3.0,
     ) -> None:
@@ -119,7 +118,7 @@ class PoseStream:
         self.pendant: PendantSettings | None = None
         """The newest settings; None until the controller has sent them."""
         self._client, self._frequency, self._timeout = client, frequency_hz, timeout_s
-        self._samples: deque[PoseSample] = deque(maxlen=queue)
+        self._samples: deque[PoseSample] = deque(maxlen=_MOST_POSES)
         self._latest: PoseSample | None = None
         self._listeners: list[list[PoseSample]] = []
         self._error: str | None = None

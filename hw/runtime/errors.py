@@ -6,6 +6,7 @@ to devices start without importing JAX.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Literal
 
 Device = Literal["robot", "active echo", "ultrasound", "tracker"]
@@ -30,7 +31,7 @@ class DeviceError(Exception):
         return f"{self.device}: {super().__str__()}"
 
     def __reduce__(self) -> tuple:
-        return _rebuild, (type(self), self.args[0], self.device)
+        return partial(type(self), device=self.device), (self.args[0],)
 
 
 class StaleError(DeviceError):
@@ -55,7 +56,3 @@ class StoppedError(DeviceError):
 def refused(message: str) -> RefusedError:
     """What the robot's gate, or one of its checks, does not allow."""
     return RefusedError(message, device="robot")
-
-
-def _rebuild(kind: type[DeviceError], message: str, device: Device) -> DeviceError:
-    return kind(message, device=device)

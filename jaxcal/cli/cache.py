@@ -106,6 +106,7 @@ def warm(
     except (OSError, RuntimeError) as error:
         raise OutputError(f"the cache cannot be used: {error}") from error
     from jaxcal.calibration.calibrate import calibrate, unknown_names
+    from jaxcal.data.problem import taken
     from jaxcal.runtime.executables import padded_images
 
     names = unknown_names(estimate)
@@ -114,9 +115,11 @@ def warm(
         for count in sorted({padded_images(count) for count in images}):
             with progress(f"compiling ({method}, {count} images)"):
                 began = time.perf_counter()
-                calibrate(_repeated(like, count), method, estimate=names)
-            taken = time.perf_counter() - began
-            print_page(f"{method}, up to {count} images: {taken:.1f} s")
+                # The first images over and over.
+                many = taken(like, [k % like.images for k in range(count)])
+                calibrate(many, method, estimate=names)
+            seconds = time.perf_counter() - began
+            print_page(f"{method}, up to {count} images: {seconds:.1f} s")
     return ExitCode.CONVERGED
 
 
@@ -179,10 +182,3 @@ def _problem(recording: str | None, pixels: bool) -> Problem:
     poses[:, :3, :3] = Rotation.random(8, rng=draws).as_matrix()
     points = draws.uniform(10.0, 50.0, (8, 2))
     return Problem.from_arrays(poses, points, kind="pixel" if pixels else "point")
-
-
-def _repeated(problem: Problem, count: int) -> Problem:
-    """As many images as that: the first ones over and over."""
-    from jaxcal.data.problem import taken
-
-    return taken(problem, [k % problem.images for k in range(count)])

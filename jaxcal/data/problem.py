@@ -323,7 +323,8 @@ def as_problem(value: Any, name: str) -> Problem:
             f"{name} takes a problem, not a path: {name}(jaxcal.load({os.fspath(value)!r})), or "
             "import the file first (jaxcal import)"
         )
-    if isinstance(value, list | tuple) and value and _are_problems(value):
+    problems = (Problem, Recording, Images)
+    if isinstance(value, list | tuple) and value and all(isinstance(v, problems) for v in value):
         raise InputError(
             f"{name} takes one problem, not {len(value)}: jaxcal.calibrate_batch takes a list"
         )
@@ -342,10 +343,6 @@ def as_batch(value: Any, name: str) -> Problem:
             raise InputError(f"{name} takes at least one problem; the list is empty")
         return stack([as_problem(each, name) for each in value])
     return as_problem(value, name)
-
-
-def _are_problems(values: Any) -> bool:
-    return all(isinstance(each, Problem | Recording | Images) for each in values)
 
 
 def check_shapes(problem: Problem) -> None:

@@ -12,6 +12,7 @@ import os
 import secrets
 import shutil
 import stat
+import tempfile
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -19,6 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from jaxcal import CalibrationError, InputError, OutputError
+from jaxcal.io.given_files import one_line
 
 try:
     import fcntl
@@ -74,16 +76,56 @@ def atomic_path(target: str | os.PathLike[str]) -> Iterator[Path]:
         _flush(final.parent, os.O_RDONLY)
 
 
-def write_text(path: str | os.PathLike[str], text: str) -> None:
-    """Write a UTF-8 text file, complete or not at all; line ends are written as they are.
+def write_bytes(path: str | os.PathLike[str], content: bytes) -> None:
+    """Write a file, complete or not at all.
 
     Raises:
         OutputError: it could not be written; the file is as it was.
     """
-    # File names that are not UTF-8 reach us as lone surrogates, which UTF-8 cannot encode.
-    content = text.encode("utf-8", errors="backslashreplace")
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
+
+
+def write_text(path: str | os.PathLike[str], text: str) -> None:
+    """:func:`write_bytes` of a text in UTF-8; line ends are written as they are."""
+    # File names that are not UTF-8 reach us as lone surrogates, which UTF-8 cannot encode.
+    write_bytes(path, text.encode("utf-8", errors="backslashreplace"))
+
+
+@contextmanager
+def made_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Make a folder and its missing parents, and check that files can be written to it.
+
+    Yields:
+        The folder. If the block raises an error, folders that were made here and are still empty
+        are removed again.
+
+    Raises:
+        OutputError: it cannot be made or written to.
+    """
+    folder = Path(path)
+    made: list[Path] = []
+    try:
+        try:
+            missing = [place for place in (folder, *folder.parents) if not place.exists()]
+            for place in reversed(missing):
+                place.mkdir(exist_ok=True)
+                made.append(place)
+            if not folder.is_dir():
+                raise OutputError(f"{path}: is a file, not a folder")
+            with tempfile.TemporaryFile(dir=folder):
+                pass
+        except OutputError:
+            raise
+        except (OSError, ValueError) as error:
+            reason = one_line(error)
+            raise OutputError(f"{path}: cannot be made or written to: {reason}") from error
+        yield folder
+    except BaseException:
+        for place in reversed(made):
+            with suppress(OSError):
+                place.rmdir()
+        raise
 
 
 STAGED = ".partial-report*"
@@ -263,5 +305,4 @@ def _flush(path: Path, flags: int) -> None:
 
 
 def _output_error(name: str, error: Exception) -> OutputError:
-    reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
-    return OutputError(f"{name}: cannot be written: {' '.join(reason.split())}")
+    return OutputError(f"{name}: cannot be written: {one_line(error)}")

@@ -67,7 +67,11 @@ def read_pixel_size(path: str | os.PathLike[str]) -> PixelSize:
     if len(regions) > _MOST_REGIONS:
         raise FormatError(f"{name}: claims {len(regions)} ultrasound regions")
     with naming(name):
-        found = [_region(name, region, data) for region in regions if _is_picture(region)]
+        found = [
+            _region(name, region, data)
+            for region in regions
+            if _whole(region, "RegionSpatialFormat") == _TWO_DIMENSIONAL
+        ]
     if not found:
         raise FormatError(
             f"{name}: states no pixel size (no two-dimensional ultrasound region in cm): measure "
@@ -102,10 +106,6 @@ def _dataset(name: str) -> Dataset:
     except Exception as error:
         # pydicom raises whatever it stumbles over.
         raise FormatError(f"{name}: is not a DICOM file: {one_line(error)[:200]}") from None
-
-
-def _is_picture(region: Dataset) -> bool:
-    return _whole(region, "RegionSpatialFormat") == _TWO_DIMENSIONAL
 
 
 def _region(name: str, region: Dataset, data: Dataset) -> PixelSize:

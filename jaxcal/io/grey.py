@@ -1,4 +1,4 @@
-"""Colour to grey by the weights of ITU-R BT.601."""
+"""Colour to grey by the weights of ITU-R BT.601, and pixels turned to the orientation MF."""
 
 from __future__ import annotations
 
@@ -19,3 +19,10 @@ def grey_of(
     grey = pixels[:, :, :3].astype(np.float64) @ _WEIGHTS
     # The weights add up to one, so no value leaves its type's range.
     return (grey if pixels.dtype.kind == "f" else np.rint(grey)).astype(pixels.dtype)
+
+
+def oriented(frame: np.ndarray, stored: str) -> np.ndarray:
+    """A frame that is stored in another orientation (UF, MN, UN) in MF."""
+    if stored[0] == "U":
+        frame = frame[:, ::-1]
+    return frame[::-1] if stored[1] == "N" else frame

@@ -43,7 +43,7 @@ from jaxcal.data.recording import (
     check_recording,
     make_images,
 )
-from jaxcal.io.atomic import atomic_path
+from jaxcal.io.atomic import write_bytes
 from jaxcal.io.given_files import check_readable, naming, path_name
 from jaxcal.io.target_search import FATES, FrameResults
 from jaxcal.io.untrusted import (
@@ -138,8 +138,7 @@ def save(
         elif segmentation is not None:
             _write_fate(file.create_group("segmentation"), segmentation)
     _read(io.BytesIO(image.getvalue()), name)
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(image.getvalue())
+    write_bytes(path, image.getvalue())
 
 
 def raw_data(root: Node) -> str | None:

@@ -13,8 +13,8 @@ from jaxcal.io.given_files import read_bytes
 # Spreadsheets' errors, in English and German, are #N/A, #NV and words like #NAME? and #DIV/0!.
 _COMMENT = re.compile(r"\s*#(?!(?:N/A|NV|[A-Z/0]+[!?])[,;\t])")
 
-_HDF5 = b"\x89HDF\r\n\x1a\n"
-"""How such a file begins."""
+HDF5_BEGINNING = b"\x89HDF\r\n\x1a\n"
+"""How a file of HDF5 begins."""
 MAXIMUM_BYTES = 64 * 2**20
 """Largest text file that is read."""
 
@@ -34,7 +34,7 @@ def text_lines(
     """
     name = os.fspath(path)
     content = read_bytes(path, MAXIMUM_BYTES)
-    if content.startswith(_HDF5):
+    if content.startswith(HDF5_BEGINNING):
         raise FormatError(f"{name}: is HDF5, not text (a recording's name ends in .h5)")
     try:
         text = content.decode("utf-8-sig")

@@ -156,17 +156,12 @@ def size_agrees(header: Header, beginning: bytes | bytearray | memoryview) -> bo
     start = _EXTENDED.size if header.version == 2 else 0
     if len(beginning) < start + _IMAGE.size:
         return False
-    _, components, scalar, _, _, width, height, depth, *_ = _IMAGE.unpack_from(beginning, start)
-    voxels = components * width * height * depth * _BYTES.get(scalar, 0)
+    _, components, scalar, _, _, *numbers = _IMAGE.unpack_from(beginning, start)
+    size = numbers[:3]
+    whole = around + _IMAGE.size + components * math.prod(size) * _BYTES.get(scalar, 0)
     # If only a part of an image is sent, there are fewer voxels than its size says.
-    return header.size <= around + _IMAGE.size + voxels and (
-        header.size == around + _IMAGE.size + voxels or _is_part(beginning, start)
-    )
-
-
-def _is_part(beginning: bytes | bytearray | memoryview, start: int) -> bool:
-    numbers = _IMAGE.unpack_from(beginning, start)
-    return numbers[20:23] != (0, 0, 0) or numbers[23:26] != numbers[5:8]
+    part = numbers[15:18] != [0, 0, 0] or numbers[18:21] != size
+    return header.size == whole or (part and header.size < whole)
 
 
 def decode_body(header: Header, body: bytes, t_host: float = math.nan) -> Message:

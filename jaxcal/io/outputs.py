@@ -12,10 +12,9 @@ from collections.abc import Callable, Iterable
 
 from jaxcal import CalibrationError, FormatError, InputError
 from jaxcal.io.given_files import path_name
+from jaxcal.io.lines import HDF5_BEGINNING
 
 Path = str | os.PathLike[str]
-
-_HDF5 = b"\x89HDF\r\n\x1a\n"
 
 
 class NotReplacedError(InputError):
@@ -86,7 +85,7 @@ def is_hdf5_recording(path: Path) -> bool:
     from jaxcal.io.hdf5 import FORMAT
     from jaxcal.io.untrusted import open_root, text
 
-    if not (os.path.isfile(path) and begins_with(_HDF5)(path)):
+    if not (os.path.isfile(path) and begins_with(HDF5_BEGINNING)(path)):
         return False
     with open_root(path) as root:
         return text(root, "format") == FORMAT
@@ -108,7 +107,7 @@ def is_recording(path: Path) -> bool:
                 return False
             found = raw_data(root)
     except FormatError as error:
-        if begins_with(_HDF5)(path):
+        if begins_with(HDF5_BEGINNING)(path):
             raise NotReplacedError(f"{error} (not replaced: name another file)") from None
         raise
     if found is not None:

@@ -19,7 +19,7 @@ import numpy as np
 
 from jaxcal import FormatError
 from jaxcal.data.poses import check_affine
-from jaxcal.io.atomic import atomic_path
+from jaxcal.io.atomic import write_bytes
 from jaxcal.io.frame_names import FramePair, capitalised, check_frames, path_between, split_name
 from jaxcal.io.given_files import naming
 from jaxcal.io.xml import Element, parse_xml, read_xml
@@ -300,8 +300,7 @@ def patch_configuration(
     _, content = read_xml(path)
     with naming(path):
         new, notes = patched_configuration(content, frames, matrix, error_mm=error_mm, date=date)
-    with atomic_path(path if out is None else out) as temporary:
-        temporary.write_bytes(new)
+    write_bytes(path if out is None else out, new)
     return notes
 
 

@@ -19,7 +19,7 @@ from jaxcal.data.poses import check_poses, inverse_poses
 from jaxcal.io.columns import LENGTHS_MM, LengthUnit
 from jaxcal.io.frame_names import FramePair, path_between
 from jaxcal.io.given_files import naming
-from jaxcal.io.grey import grey_of
+from jaxcal.io.grey import grey_of, oriented
 from jaxcal.io.pixel_stream import Packing, PixelStream
 from jaxcal.runtime.array_types import Bool, Float, Int
 from jaxcal.runtime.messages import quoted
@@ -241,7 +241,7 @@ class TrackedSequence:
             return
         if isinstance(pixels, FolderPixels):
             for number in numbers:
-                yield _oriented(_png_image(pixels, number), orientation or "MF")
+                yield oriented(_png_image(pixels, number), orientation or "MF")
             return
         stored = pixels.orientation or orientation
         if orientation not in (None, stored):
@@ -262,8 +262,9 @@ class TrackedSequence:
             PixelStream(pixels.path, pixels.start, pixels.packing, size * len(self)) as stream,
         ):
             for number in numbers:
-                content = stream.read_at(number * size, size)
-                yield _oriented(_grey(content, pixels), stored)
+                frame = np.frombuffer(stream.read_at(number * size, size), pixels.dtype)
+                frame = frame.reshape(pixels.rows, pixels.columns, pixels.channels)
+                yield oriented(grey_of(frame), stored)
             stream.check_end()
 
 
@@ -278,7 +279,7 @@ def _hdf5_images(
         for number in numbers:
             if node is None:
                 raise FormatError(f"/{pixels.dataset} is missing")
-            yield _oriented(row(node, number), orientation)
+            yield oriented(row(node, number), orientation)
 
 
 def _png_image(pixels: FolderPixels, number: int) -> np.ndarray:
@@ -289,14 +290,3 @@ def _png_image(pixels: FolderPixels, number: int) -> np.ndarray:
     if frame.shape != (pixels.rows, pixels.columns):
         raise FormatError(f"{pixels.paths[number]}: has changed its size while it was being read")
     return frame
-
-
-def _grey(content: bytes, pixels: Pixels) -> np.ndarray:
-    frame = np.frombuffer(content, pixels.dtype)
-    return grey_of(frame.reshape(pixels.rows, pixels.columns, pixels.channels))
-
-
-def _oriented(frame: np.ndarray, stored: str) -> np.ndarray:
-    if stored[0] == "U":
-        frame = frame[:, ::-1]
-    return frame[::-1] if stored[1] == "N" else frame

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.io.atomic import atomic_path
+from jaxcal.io.atomic import write_bytes
 from jaxcal.io.frame_names import FramePair
 from jaxcal.io.given_files import check_readable, naming
 from jaxcal.io.metaimage import check_data_name, metaimage_header, read_metaimage
@@ -80,23 +80,19 @@ def write_sequence(
         head = nrrd_header(stack, orientation, compressed)
         lines = [f"{key}:={value}" for of_frame in fields for key, value in of_frame]
         packed = packed_pixels(stack, "gzip" if compressed else "raw")
-        content = "\n".join([*head, *lines, "", ""]).encode() + packed
-        _put(path, content)
+        write_bytes(path, "\n".join([*head, *lines, "", ""]).encode() + packed)
         return
     packed = packed_pixels(stack, "zlib" if compressed else "raw")
     head = metaimage_header(stack, orientation, images is not None, compressed, len(packed))
     lines = [f"{key} = {value}" for of_frame in fields for key, value in of_frame]
     if name.lower().endswith(".mha"):
-        _put(path, "\n".join([*head, *lines, "ElementDataFile = LOCAL", ""]).encode() + packed)
+        write_bytes(
+            path, "\n".join([*head, *lines, "ElementDataFile = LOCAL", ""]).encode() + packed
+        )
         return
     data = Path(name).with_suffix(".zraw" if compressed else ".raw")
     with naming(path):
         check_data_name(data.name)
     # The pixels first: a header without them would be half a recording.
-    _put(data, packed)
-    _put(path, "\n".join([*head, *lines, f"ElementDataFile = {data.name}", ""]).encode())
-
-
-def _put(path: str | os.PathLike[str], content: bytes) -> None:
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(content)
+    write_bytes(data, packed)
+    write_bytes(path, "\n".join([*head, *lines, f"ElementDataFile = {data.name}", ""]).encode())

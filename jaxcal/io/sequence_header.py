@@ -160,8 +160,8 @@ def sequence_of(
         if image_status in fields and fields[image_status][0].upper() != "OK":
             image_valid[number] = False
         for field_name, (value, line) in fields.items():
-            pair = _transform_frames(field_name)
-            if pair is None:
+            pair = split_name(field_name.removesuffix("Transform"))
+            if pair is None or not field_name.endswith("Transform"):
                 continue
             if pair not in transforms:
                 transforms[pair] = np.full((count, 4, 4), np.nan)
@@ -181,12 +181,6 @@ def sequence_of(
         name,
         without_status=tuple(without_status),
     )
-
-
-def _transform_frames(field_name: str) -> FramePair | None:
-    if not field_name.endswith("Transform"):
-        return None
-    return split_name(field_name.removesuffix("Transform"))
 
 
 def _stamp(value: str, line: int) -> float:

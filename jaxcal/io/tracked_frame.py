@@ -23,7 +23,7 @@ import numpy as np
 
 from jaxcal import FormatError
 from jaxcal.io.frame_names import split_name
-from jaxcal.io.grey import grey_of
+from jaxcal.io.grey import grey_of, oriented
 from jaxcal.io.message_content import ContentError, Picture, Tracked, TrackedFrame
 from jaxcal.io.xml import parse_xml
 
@@ -65,9 +65,8 @@ def decode_tracked_frame(content: memoryview) -> TrackedFrame:
     xml = bytes(content[_HEAD.size : _HEAD.size + xml_size])
     pixels = np.frombuffer(content, np.uint8, offset=_HEAD.size + xml_size)
     stored = _ORIENTATIONS[orientation] or "MF"
-    frame = grey_of(pixels.reshape(rows, columns, components))
-    frame = frame[:, ::-1] if stored[0] == "U" else frame
-    frame = np.ascontiguousarray(frame[::-1] if stored[1] == "N" else frame)
+    frame = oriented(grey_of(pixels.reshape(rows, columns, components)), stored)
+    frame = np.ascontiguousarray(frame)
     frame.setflags(write=False)
     return TrackedFrame(Picture(frame, (1.0, 1.0)), _transforms(xml.rstrip(b"\0")))
 

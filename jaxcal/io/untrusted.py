@@ -201,7 +201,7 @@ def check_rows(node: Node, axes: int, most_bytes: int, kinds: str) -> tuple[int,
         FormatError: anything else, virtual, stored elsewhere, or packed by an unknown filter.
     """
     with _reading(str(node)):
-        dataset, layout = _stored_here(node)
+        dataset, layout = stored_here(node)
         shape = dataset.shape or ()
         if dataset.dtype.kind not in kinds or len(shape) != axes:
             raise FormatError(f"{node} has type {quoted(str(dataset.dtype))} and shape {shape}")
@@ -237,7 +237,7 @@ def array(node: Node, shape: tuple[int | UpTo, ...], kinds: str = "iuf") -> np.n
             too large, packed by an unknown filter, or damaged.
     """
     with _reading(str(node)):
-        dataset, layout = _stored_here(node)
+        dataset, layout = stored_here(node)
         dtype = dataset.dtype
         if dtype.kind not in kinds or h5py.check_enum_dtype(dtype) is not None:
             raise FormatError(
@@ -258,7 +258,7 @@ def array(node: Node, shape: tuple[int | UpTo, ...], kinds: str = "iuf") -> np.n
 def string(node: Node) -> str:
     """The one short text of a dataset; FormatError for anything else."""
     with _reading(str(node)):
-        dataset, _ = _stored_here(node)
+        dataset, _ = stored_here(node)
         kind = dataset.id.get_type()
         if kind.get_class() != h5t.STRING or dataset.shape not in ((), (1,)):
             raise FormatError(f"{node} must be one text")
@@ -321,8 +321,12 @@ def _reading(what: str) -> Iterator[None]:
         raise FormatError(f"{what} cannot be read: {one_line(error)}") from None
 
 
-def _stored_here(node: Node) -> tuple[h5py.Dataset, Any]:
-    """A dataset that holds its own data, and HDF5's plan of how they are stored."""
+def stored_here(node: Node) -> tuple[h5py.Dataset, Any]:
+    """A dataset that holds its own data, and HDF5's plan of how they are stored.
+
+    Raises:
+        FormatError: anything else.
+    """
     dataset = node.item
     if not isinstance(dataset, h5py.Dataset):
         raise FormatError(f"{node} must be a dataset")

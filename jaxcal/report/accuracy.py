@@ -152,8 +152,7 @@ def _tre(
         image = np.concatenate([image, given])
         places = np.concatenate([places, given * scale + origin])
     at = tre_at(answer, places)
-    side = np.linspace(-1.0, 1.0, _ACROSS)
-    cells = region.place(np.stack(np.meshgrid(side, side), axis=-1))[..., [0, 2]]
+    cells = region.grid(_ACROSS, _ACROSS).reshape(_ACROSS, _ACROSS, 3)[..., [0, 2]]
     mapped = tre_at(answer, cells)
     return {
         "region": {

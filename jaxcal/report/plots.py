@@ -70,8 +70,8 @@ def plot_tre(calibration: Calibration, factor: float = 1.0) -> Figure:
     """
     answer, recording = _determined(calibration, "there is no error to map")
     region = region_of(answer, recording)
-    side = np.linspace(-1.0, 1.0, _ALONG_A_SIDE)
-    cells = region.place(np.stack(np.meshgrid(side, side), axis=-1))[..., [0, 2]]
+    cells = region.grid(_ALONG_A_SIDE, _ALONG_A_SIDE)[:, [0, 2]]
+    cells = cells.reshape(_ALONG_A_SIDE, _ALONG_A_SIDE, 2)
     error = factor * tre_at(answer, cells).rms
     figure = canvas(COLUMN_MM, COLUMN_MM)
     # Axes of equal scale shrink after they are laid out, and only this layout sees it.

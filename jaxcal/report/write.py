@@ -6,7 +6,6 @@ import csv
 import io
 import json
 import os
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -14,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from jaxcal import CalibrationError, FormatError, InputError, OutputError
+from jaxcal import FormatError, InputError
 from jaxcal.data.recording import Recording
-from jaxcal.io.atomic import STAGED, replace_files, write_text
-from jaxcal.io.given_files import one_line, path_name
+from jaxcal.io.atomic import STAGED, made_folder, replace_files, write_text
+from jaxcal.io.given_files import path_name
 from jaxcal.report.convergence import Curve
 from jaxcal.report.verdict import verdict
 from jaxcal.result.calibration import Calibration
@@ -63,30 +62,9 @@ def prepare_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
         InputError: files of a report's names are there, but no report.
         OutputError: it cannot be made or written to.
     """
-    folder = Path(path_name(path))
-    made: list[Path] = []
-    try:
-        try:
-            missing = [place for place in (folder, *folder.parents) if not place.exists()]
-            for place in reversed(missing):
-                place.mkdir(exist_ok=True)
-                made.append(place)
-            if not folder.is_dir():
-                raise OutputError(f"{path}: is a file, not a folder")
-            with tempfile.TemporaryFile(dir=folder):
-                pass
-            _check_report(folder)
-        except CalibrationError:
-            raise
-        except (OSError, ValueError) as error:
-            reason = one_line(error)
-            raise OutputError(f"{path}: cannot be made or written to: {reason}") from error
+    with made_folder(path_name(path)) as folder:
+        _check_report(folder)
         yield folder
-    except BaseException:
-        for place in reversed(made):
-            with suppress(OSError):
-                place.rmdir()
-        raise
 
 
 def _check_report(folder: Path) -> None:

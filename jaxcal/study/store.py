@@ -19,7 +19,6 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-import tempfile
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Generic, TypeVar, overload
@@ -27,8 +26,8 @@ from typing import Any, Generic, TypeVar, overload
 import h5py
 import numpy as np
 
-from jaxcal import FormatError, InputError, OutputError
-from jaxcal.io.atomic import atomic_path, write_text
+from jaxcal import FormatError, InputError
+from jaxcal.io.atomic import made_folder, write_bytes, write_text
 from jaxcal.io.given_files import check_readable, one_line, path_name
 from jaxcal.io.untrusted import array, child, number, open_root, text
 from jaxcal.study.interface import Chunk, Study
@@ -129,32 +128,26 @@ class Store(Generic[S]):
         Raises:
             OutputError: the disk is full, the folder not writable.
         """
-        path = self.path(chunk)
         start = chunk.condition * self.spec.trials
         wanted = self.spec.arrays(chunk)
         results = {name: results[name] for name in wanted}
-        with atomic_path(path) as temporary:
-            # HDF5 notices a full disk only when it closes the file, and then loses the reason. A
-            # file that is made in memory and written in one go reports it.
-            image = _pack(
-                results,
-                {
-                    "format": FORMAT,
-                    "version": VERSION,
-                    "spec_sha256": self.spec.sha256,
-                    "chunk": chunk.index,
-                    "condition": chunk.condition,
-                    "trial_start": chunk.start,
-                    "trial_stop": chunk.stop,
-                    "index_start": start + chunk.start,
-                    "index_stop": start + chunk.stop,
-                    "checksum": _checksum(results),
-                    **maker,
-                },
-                {name: array_spec.unit for name, array_spec in wanted.items()},
-            )
-            with temporary.open("wb") as stream:
-                stream.write(image)
+        attributes = {
+            "format": FORMAT,
+            "version": VERSION,
+            "spec_sha256": self.spec.sha256,
+            "chunk": chunk.index,
+            "condition": chunk.condition,
+            "trial_start": chunk.start,
+            "trial_stop": chunk.stop,
+            "index_start": start + chunk.start,
+            "index_stop": start + chunk.stop,
+            "checksum": _checksum(results),
+            **maker,
+        }
+        units = {name: array_spec.unit for name, array_spec in wanted.items()}
+        # HDF5 notices a full disk only when it closes the file, and then loses the reason. A file
+        # that is made in memory and written in one go reports it.
+        write_bytes(self.path(chunk), _pack(results, attributes, units))
 
     def read(self, chunk: Chunk) -> dict[str, np.ndarray]:
         """The arrays of a chunk, checked; the file is not trusted.
@@ -206,23 +199,8 @@ class Store(Generic[S]):
         return self.folder / "spec.json"
 
     def _make_folder(self) -> None:
-        chunks = self.folder / "chunks"
-        made: list[Path] = []
-        try:
-            for place in (*reversed(self.folder.parents), self.folder, chunks):
-                if not place.exists():
-                    place.mkdir(exist_ok=True)
-                    made.append(place)
-            for place in (self.folder, chunks):
-                with tempfile.TemporaryFile(dir=place):
-                    pass
-        except (OSError, ValueError) as error:
-            for place in reversed(made):
-                with suppress(OSError):
-                    place.rmdir()
-            raise OutputError(
-                f"{self.folder}: cannot be made or written to: {one_line(error)}"
-            ) from error
+        with made_folder(self.folder), made_folder(self.folder / "chunks"):
+            pass
 
     def sweep(self) -> None:
         """Remove what a killed process had begun to write."""

@@ -22,6 +22,7 @@ from hw.recording.file import RecordingWriter
 from hw.recording.layout import RecordingHeader
 from hw.recording.recorder import Recorder
 from jaxcal.cli.main import main
+from jaxcal.data.timing import ClockFit
 
 PROBE = {"kind": "linear", "elements": 128, "pitch_mm": 58.5 / 128, "sound_speed_m_s": 1490.0}
 HEADER = RecordingHeader(kind="time_of_flight", probe=PROBE, settings='{"placement": "none"}')
@@ -115,7 +116,7 @@ def test_a_finished_recording_is_what_calibrate_takes(tmp_path, capsys):
             recorder.add_images(frames(k, 1))
             recorder.add_echo(echo(k, 1))
             take(recorder, recording, k)
-        recorder.add_clock("robot", 0.1, 1e-5, 0.5, 1e-4, 1.0)
+        recorder.add_clock("robot", ClockFit(0.1, 1e-5, 0.5, np.array([1e-4])), 1.0)
         recorder.put("truth", "point", np.zeros(3), "mm")
         recorder.put("truth", "elevation", np.zeros(12), "mm")
         recorder.put("truth", "image_to_probe", np.eye(4), "mm")

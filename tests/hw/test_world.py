@@ -11,16 +11,16 @@ from hw.bench.look import Look
 from hw.bench.world import FULL_SCALE, make_world
 from hw.midplane.pattern_injection import bar
 from hw.planning.poses import plan_poses
-from hw.runtime.rigid import rigid, rotation_matrix
+from hw.runtime.rigid import rigid
 from jaxcal import InputError
-from jaxcal.data.poses import rotation_angle
+from jaxcal.data.poses import rotation_angle, rotations_from_vectors
 from jaxcal.data.segmentation.image import localise
 
 
 def placed(world, lateral: float, elevation: float, axial: float, turn=(0.0, 0.0, 0.0)):
     """A true pose that has the target at a place of the image."""
     pose = np.eye(4)
-    pose[:3, :3] = rotation_matrix(np.asarray(turn)) @ np.diag([1.0, -1.0, -1.0])
+    pose[:3, :3] = rotations_from_vectors(np.asarray(turn)) @ np.diag([1.0, -1.0, -1.0])
     x = world.image_to_probe
     place = x[:3, :3] @ [lateral, elevation, axial] + x[:3, 3]
     pose[:3, 3] = world.point_mm - pose[:3, :3] @ place
@@ -164,7 +164,7 @@ def test_wires_cross_in_the_plane_and_part_beside_it():
     look = Look()
     camera, rng = Camera(world, look), np.random.default_rng(0)
     beside = np.asarray(look.beside_mm)
-    turned = np.diag([1.0, -1.0, -1.0]) @ rotation_matrix(np.array([0.0, 0.0, 0.3]))
+    turned = np.diag([1.0, -1.0, -1.0]) @ rotations_from_vectors(np.array([0.0, 0.0, 0.3]))
     x = world.image_to_probe
 
     def draw(elevation: float):
