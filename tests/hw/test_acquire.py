@@ -240,7 +240,7 @@ def test_signals_end_a_background_job_in_order(tmp_path, number, times, moment, 
         rest = process.stderr.read()
     assert process.wait() == 130, rest
     # More may have been taken before the signal came.
-    told = rf"jaxcal-hw: error: interrupted; [{least}-4] of 4 images are in {path}; .*then: "
+    told = rf"jaxcal-hw: error: interrupted; [{least}-4] of 4 images are in {path}; to go on: "
     told += rf"jaxcal-hw acquire {path} --resume --bench"
     assert re.fullmatch(told, rest.splitlines()[-1]), rest
     assert "Traceback" not in rest
