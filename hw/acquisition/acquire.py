@@ -189,9 +189,10 @@ def acquire(
     if recorder.error is not None and not interrupted:
         # The recorder's failure is the cause of what went wrong.
         reason = str(recorder.error)
+    then = "to go on" if interrupted else "correct this, then"
     raise AcquisitionStopped(
-        f"{reason}; {estimator.count} of {job.images} images are in {recorder.kept}; correct "
-        f"this, then: {resume_command(recorder.kept, job.request)}",
+        f"{reason}; {estimator.count} of {job.images} images are in {recorder.kept}; {then}: "
+        f"{resume_command(recorder.kept, job.request)}",
         interrupted=interrupted,
         by_itself=by_itself and recorder.error is None,
     )

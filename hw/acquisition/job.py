@@ -14,7 +14,13 @@ from hw.recording.check import Progress, is_complete, read_progress
 from hw.recording.file import RecordingWriter
 from hw.recording.layout import RecordingHeader
 from hw.recording.recorder import Recorder
-from hw.recording.resuming import check_same_robot, compare, described, described_probe
+from hw.recording.resuming import (
+    check_same_clock,
+    check_same_robot,
+    compare,
+    described,
+    described_probe,
+)
 from hw.recording.session import Session
 from hw.robot.identity import LOCAL
 from hw.robot.motion_plan import MotionPlan
@@ -102,7 +108,8 @@ def motion_plan(job: Job, session: Session) -> MotionPlan:
     """The plan that the confirmation is bound to; on resume the robot must be the same one.
 
     Raises:
-        RefusedError: another robot, or a controller that does not tell what must be confirmed.
+        RefusedError: another robot, electronics with another clock, or a controller that does not
+            report what must be confirmed.
     """
     identity = session.poses.identity()
     if identity.remote is False:
@@ -115,6 +122,7 @@ def motion_plan(job: Job, session: Session) -> MotionPlan:
         )
     if job.progress is not None:
         check_same_robot(job.progress.settings.get("robot"), identity.name, offset)
+        check_same_clock(job.progress.settings.get("active_echo"), session.echo.clock_hz())
     pendant = session.poses.pendant
     if pendant is None:
         raise refused("the controller does not report its speed slider")
@@ -155,10 +163,16 @@ def record_confirmed(job: Job, plan: MotionPlan, session: Session, recorder: Rec
     """
     known = {"serial_number": plan.serial, "tcp_offset": list(plan.tcp_offset)}
     bench = described(job.setup, job.targets)
-    settings = {"request": asdict(job.request), "robot": known, "bench": bench}
+    echo = {"clock_hz": session.echo.clock_hz()}
+    settings = {
+        "request": asdict(job.request),
+        "robot": known,
+        "bench": bench,
+        "active_echo": echo,
+    }
     recorder.put("plan", "settings", np.frombuffer(json.dumps(settings).encode(), np.uint8), "1")
     recorder.attributes("tracker", known)
-    recorder.attributes("ae", {"clock_hz": session.echo.clock_hz(), "trigger_delay_s": 0.0})
+    recorder.attributes("ae", {**echo, "trigger_delay_s": 0.0})
     recorder.sync()
 
 

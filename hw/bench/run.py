@@ -176,7 +176,7 @@ def start_bench(**options: Any) -> Bench:
             process.communicate()
             complaints.seek(0)
             said = complaints.read(1 << 16).decode(errors="replace").strip().splitlines()
-            raise InputError(f"the bench did not start: {said[-1] if said else 'no reason told'}")
+            raise InputError(f"the bench did not start: {said[-1] if said else 'no reason given'}")
     return Bench(process, json.loads(line))
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from hw.recording.check import Progress
 from hw.robot.stream import offset_changed
-from hw.runtime.errors import refused
+from hw.runtime.errors import RefusedError, refused
 from hw.setup.description import Setup
 from jaxcal import InputError
 from jaxcal.data.probe import LinearProbe
@@ -126,6 +126,17 @@ def check_same_robot(before: object, serial: str, tcp_offset: Sequence[float]) -
     else:
         return
     raise refused(f"{what}: its images would not fit together")
+
+
+def check_same_clock(before: object, clock_hz: float) -> None:
+    """Refuse electronics with another clock: all ticks of a recording are of one clock."""
+    known = before.get("clock_hz") if isinstance(before, dict) else None
+    if known is not None and not _same(known, clock_hz):
+        raise RefusedError(
+            f"the recording was begun with electronics that count {_shown(known)} ticks a second, "
+            f"these count {_shown(clock_hz)}: their frames would not fit together",
+            device="active echo",
+        )
 
 
 def _same(old: Any, new: Any) -> bool:

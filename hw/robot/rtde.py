@@ -104,6 +104,8 @@ def state_text(robot_mode: int, safety_bits: int) -> str:
 _BOUND_TRIES, _LEAST_TRIES, _BOUND_S, _BOUND_WITHIN_S = 5, 3, 0.01, 0.25
 """Most tries to bound the latency; fewest tries, unless a bound is tight; a bound is tight below
 this plus three periods (s); beyond the fewest, no try begins after this time (wall s)."""
+_FURTHEST = 100.0
+"""No TCP is further from its base (m), or turned by more (rad)."""
 _PAYLOAD_TOLERANCE_KG, _COG_TOLERANCE_M, _SPEED_TOLERANCE = 1e-3, 1e-4, 1e-3
 
 
@@ -140,7 +142,7 @@ class PendantSettings:
 
     def __str__(self) -> str:
         if self.payload_kg is None:
-            payload = "payload not told"
+            payload = "payload not reported"
         else:
             payload = f"payload {self.payload_kg:g} kg at {_metres(self.payload_cog_m)}"
         return f"{payload}, speed slider at {100 * self.speed_fraction:.0f} %"
@@ -293,6 +295,9 @@ class PacketReader:
         if not all(map(math.isfinite, values)):
             raise LostError("a packet holds NaN or Inf", device="robot")
         told: dict[str, Any] = {name: values[place] for name, place in self._places.items()}
+        if max(map(abs, told["actual_TCP_pose"])) > _FURTHEST:
+            # It would overflow to NaN, which is in no box and out of none.
+            raise LostError("a packet holds an impossible pose", device="robot")
         pendant = PendantSettings(
             told.get("payload"), told.get("payload_cog"), told["target_speed_fraction"]
         )

@@ -81,7 +81,7 @@ def _robot(setup: Setup, seconds: float) -> Finding:
             wrong.append("it does not report its TCP offset: put [robot] tcp_offset into the setup")
     name = identity.name
     if not identity.identified:
-        name += " (nothing identifies this arm: neither serial number nor calibration is told)"
+        name += " (nothing identifies this arm: neither serial number nor calibration is reported)"
     return Finding("robot", f"{name}, {stream.pendant}, {rate:.0f} poses/s", tuple(wrong))
 
 

@@ -274,7 +274,7 @@ class LiveView(Audience):
             return told["url"]
         process.kill()
         process.communicate()
-        why = told.get("error", "no reason told")
+        why = told.get("error", "no reason given")
         raise InputError(f"view: the viewer did not start: {why}")
 
 

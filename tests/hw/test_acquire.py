@@ -27,10 +27,17 @@ from test_recorder import wait_until_closed
 
 import jaxcal
 from hw.acquisition.acquire import AcquisitionStopped, Outcome, acquire
-from hw.acquisition.job import motion_plan, open_recorder, plan_to_go, prepare
+from hw.acquisition.job import (
+    motion_plan,
+    open_recorder,
+    plan_to_go,
+    prepare,
+    record_confirmed,
+)
 from hw.acquisition.outcome import lines_of, share_inside
 from hw.acquisition.request import AcquisitionRequest, request_in
 from hw.acquisition.stage import ProbeStage
+from hw.bench.active_echo import AuspisEmulator
 from hw.bench.run import Bench
 from hw.midplane.search import PlacementError, Settings
 from hw.planning.poses import Extent
@@ -240,7 +247,7 @@ def test_signals_end_a_background_job_in_order(tmp_path, number, times, moment, 
         rest = process.stderr.read()
     assert process.wait() == 130, rest
     # More may have been taken before the signal came.
-    told = rf"jaxcal-hw: error: interrupted; [{least}-4] of 4 images are in {path}; .*then: "
+    told = rf"jaxcal-hw: error: interrupted; [{least}-4] of 4 images are in {path}; to go on: "
     told += rf"jaxcal-hw acquire {path} --resume --bench"
     assert re.fullmatch(told, rest.splitlines()[-1]), rest
     assert "Traceback" not in rest
@@ -571,6 +578,28 @@ def test_a_resumed_plan_holds_the_poses_that_the_way_leads_through():
     ]:
         plan = plan_to_go(whole, missing, here)
         np.testing.assert_array_equal(plan.targets, whole.targets[rows])
+
+
+def test_a_resumed_run_needs_electronics_with_the_same_clock(e_series, tmp_path):
+    """The ticks of its new frames would be read as those of the old clock, or the reverse."""
+    path, setup = tmp_path / "rec.h5", setup_of(e_series)
+    job = prepare(setup, path, AcquisitionRequest(4, "none", 1, bench=3))
+    with open_recorder(path, job) as recorder, Session(setup, recorder) as session:
+        record_confirmed(job, motion_plan(job, session), session, recorder)
+    resumed = prepare(setup, path, None)
+
+    def silence(t: float, threshold: int) -> tuple[np.ndarray, np.ndarray]:
+        return np.full(setup.probe.elements, np.nan), np.zeros(setup.probe.elements)
+
+    with (
+        AuspisEmulator(
+            silence, clock=setup.clock, lines=setup.probe.elements, clock_hz=80e6
+        ) as other,
+        open_recorder(path, resumed) as recorder,
+        Session(replace(setup, active_echo_url=other.path), recorder) as session,
+        pytest.raises(RefusedError, match=r"active echo: .* 100000000\.0 ticks .* 80000000\.0:"),
+    ):
+        motion_plan(resumed, session)
 
 
 @pytest.mark.parametrize(

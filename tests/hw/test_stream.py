@@ -337,13 +337,26 @@ def test_what_is_no_controller_is_refused(messages, text):
         PacketReader(host, timeout_s=0.5 if "does not answer" in text else 30.0)
 
 
-@pytest.mark.parametrize("payload", [b"\x01" + b"\0" * 8, b"\x01" + b"\xff" * 256])
+def packet(pose: tuple[float, ...]) -> bytes:
+    """Zeros but for the pose."""
+    return b"\x01" + struct.pack(">7d", 0.0, *pose) + bytes(8 * 12 + 4 * 4 + 8 * 17)
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b"\x01" + b"\0" * 8,
+        b"\x01" + b"\xff" * 304,
+        packet((0.0, 0.0, 0.0, 1e200, 0.0, 0.0)),
+        packet((1e4, 0.0, 0.0, 0.0, 0.0, 0.0)),
+    ],
+)
 def test_packets_that_do_not_fit_the_recipe_end_the_connection(payload):
     opening = [rtde(b"V", b"\x01"), VERSION, rtde(b"O", TYPES), rtde(b"S", b"\x01")]
     host = answers(*opening[:-1], opening[-1] + rtde(b"M", b"text") + rtde(b"U", payload))
     with (
         contextlib.closing(PacketReader(host, timeout_s=30.0)) as reader,
-        pytest.raises(LostError, match=r"bytes came instead|NaN"),
+        pytest.raises(LostError, match=r"bytes came instead|NaN|impossible pose"),
     ):
         again_and_again(reader.read)
 
