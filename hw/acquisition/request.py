@@ -48,22 +48,22 @@ class AcquisitionRequest:
     phantom: str = PHANTOMS[0]
 
     def __post_init__(self) -> None:
-        if self.phantom not in PHANTOMS:
-            raise InputError(f"phantom must be one of {', '.join(PHANTOMS)}")
-        if self.plan not in PLANS:
-            raise InputError(f"plan must be one of {', '.join(PLANS)}")
+        for name, choices in (
+            ("phantom", PHANTOMS),
+            ("plan", PLANS),
+            ("placement", PLACEMENTS),
+            ("operator", OPERATORS),
+        ):
+            if getattr(self, name) not in choices:
+                raise InputError(f"{name} must be one of {', '.join(choices)}")
         wanted = self.until_tre_mm
         if wanted is not None and not (np.isfinite(wanted) and wanted > 0):
             raise InputError(f"until_tre_mm must be a positive number of mm, not {wanted}")
         if wanted is not None and self.plan != "optimal":
             raise InputError("until_tre_mm needs the plan optimal")
-        if self.placement not in PLACEMENTS:
-            raise InputError(f"placement must be one of {', '.join(PLACEMENTS)}")
         if self.placement not in PLACEMENTS_OF[self.phantom]:
             fitting = " or ".join(PLACEMENTS_OF[self.phantom])
             raise InputError(f"with the {self.phantom} placement is {fitting}")
-        if self.operator not in OPERATORS:
-            raise InputError(f"operator must be one of {', '.join(OPERATORS)}")
         whole_number("images", self.images, 4, MOST_IMAGES)
         whole_number("seed", self.seed, 0, LARGEST_SEED)
         if self.bench is not None:

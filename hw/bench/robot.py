@@ -200,20 +200,13 @@ class EmulatedRobot(RobotProcess):
         host: its loopback address.
         speed: of bench time.
         version: of its controller.
-        raw: where the arm starts, m and rotation vector (rad).
-        tcp_offset: (6,) m and rotation vector (rad).
     """
 
     def __init__(
-        self,
-        host: str = "127.0.0.2",
-        *,
-        speed: float = 1.0,
-        version: tuple[int, ...] = E_SERIES,
-        raw: Sequence[float] = START,
-        tcp_offset: Sequence[float] = (0.0, 0.0, 0.1, 0.0, 0.0, 0.0),
+        self, host: str, *, speed: float = 1.0, version: tuple[int, ...] = E_SERIES
     ) -> None:
-        arm = Arm(raw, tcp_offset=tcp_offset, model=model_of(version))
+        tcp_offset = (0.0, 0.0, 0.1, 0.0, 0.0, 0.0)
+        arm = Arm(START, tcp_offset=tcp_offset, model=model_of(version))
         super().__init__(arm, host, version=version, clock=Clock(speed))
         self.start()
 

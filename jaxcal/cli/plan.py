@@ -155,6 +155,7 @@ def plan(
     import_engine()
     from jaxcal import design
     from jaxcal.design.count import plan_until
+    from jaxcal.io.atomic import save_figure
     from jaxcal.io.outputs import begins_with, check_output
     from jaxcal.runtime.jax_cache import enable_compilation_cache
 
@@ -175,7 +176,7 @@ def plan(
         else:
             found = plan_until(candidates, until_tre, criterion, result)
         if figure is not None:
-            _draw(found, until_tre, figure)
+            save_figure(design.plan_figure(found, until_tre), figure)
         record = _record(found, recording, candidates.constraints.region)
     if simulate:
         with progress("calibrating simulated recordings"):
@@ -270,13 +271,6 @@ def _from_recording(
     if depth is not None or lateral is not None:
         candidates = around(_region(candidates.constraints.region, depth, lateral))
     return result, candidates
-
-
-def _draw(found: Plan, wanted: float | None, path: str) -> None:
-    from jaxcal.design import plan_figure
-    from jaxcal.io.atomic import save_figure
-
-    save_figure(plan_figure(found, wanted), path)
 
 
 def _record(found: Plan, recording: str | None, region: Region) -> dict[str, Any]:

@@ -146,11 +146,6 @@ class ClockFit:
     reference_s: float
     delay_s: Float[np.ndarray, " n"]
 
-    def to_host(self, t_device: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
-        """Host times (s) of device times."""
-        device = np.asarray(t_device, dtype=np.float64)
-        return device + self.offset_s + self.drift * (device - self.reference_s)
-
 
 def fit_clock(t_device: np.ndarray, t_host: np.ndarray) -> ClockFit:
     """Offset and drift between a device's clock and the host's, from stamps of the same samples.
