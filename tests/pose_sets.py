@@ -40,7 +40,7 @@ def _turned(rng, count: int, largest: float, axis: np.ndarray | None = None) -> 
     return Rotation.from_rotvec(axes * rng.uniform(-largest, largest, (count, 1))).as_matrix()
 
 
-def make(kind: str, seed: int, elevation: float, noise: float, images: int = IMAGES) -> PoseSet:
+def make(kind: str, seed: int, elevation: float, noise: float) -> PoseSet:
     """One random set of a kind.
 
     Args:
@@ -48,12 +48,9 @@ def make(kind: str, seed: int, elevation: float, noise: float, images: int = IMA
         seed: of its draws.
         elevation: SD of the elevational offsets, mm (line-in-plane has none).
         noise: SD of lateral position; a fifth of it on the range, mm.
-        images: number of images, those that are masked out included.
     """
     rng = np.random.default_rng([seed, sum(map(ord, kind))])
-    count = {"few": int(rng.integers(4, 7)), "cone": images}.get(
-        kind, int(rng.integers(12, images + 1))
-    )
+    count = {"few": int(rng.integers(4, 7)), "cone": 40}.get(kind, int(rng.integers(12, 41)))
     largest = np.radians(rng.uniform(15, 30))
     lateral, depth = rng.uniform(-25, 25, count), rng.uniform(15, 85, count)
     offset = elevation * rng.normal(size=count)
@@ -83,15 +80,15 @@ def make(kind: str, seed: int, elevation: float, noise: float, images: int = IMA
     )
     target = 100 * rng.normal(size=3)
     q = np.stack([lateral, offset, depth], axis=1)
-    poses = np.tile(np.eye(4), (images, 1, 1))
+    poses = np.tile(np.eye(4), (IMAGES, 1, 1))
     poses[:count, :3, :3] = rotations
     in_probe = q @ x[:3, :3].T + x[:3, 3]
     poses[:count, :3, 3] = target - np.einsum("nij,nj->ni", rotations, in_probe)
     sigma = np.maximum([noise, 0.2 * noise, elevation], 1e-3)
-    points = np.tile([0.0, 50.0], (images, 1))
+    points = np.tile([0.0, 50.0], (IMAGES, 1))
     exact = np.stack([lateral, np.hypot(offset, depth)], axis=1)
     points[:count] = exact + noise * np.array([1.0, 0.2]) * rng.normal(size=(count, 2))
-    mask = np.arange(images) < count
+    mask = np.arange(IMAGES) < count
     if kind == "few":
         # With fewer than 8 images the solver holds its SDs: these are what it can know.
         sigma = np.array([0.5, 0.5, 1.0])
