@@ -47,6 +47,7 @@ def compare(
 
     if not 2 <= len(calibrations) <= MOST_FILES:
         raise click.UsageError(f"name 2 to {MOST_FILES} calibrations, not {len(calibrations)}")
+    transforms = [load_calibration(name) for name in calibrations]
     points = np.array(pixel) if pixel else None
     for name in calibrations:
         points = stated_points(name) if points is None else points
@@ -55,7 +56,6 @@ def compare(
             "none of these files says which part of the image was used: name points of the image "
             "by --pixel U V"
         )
-    transforms = [load_calibration(name) for name in calibrations]
     pairs = [
         (
             calibrations[a],
