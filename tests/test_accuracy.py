@@ -551,10 +551,12 @@ def test_pixels_of_an_unusual_size_are_named():
         assert len(unusual) == (factor < 1)
 
 
-def test_resampling_that_agrees_changes_nothing(record):
+@pytest.mark.parametrize("left_out", [0, 10, 20])
+def test_resampling_that_agrees_changes_nothing(record, left_out):
     changed = stating(record, 0.4)
     count = changed["images"]
-    quiet = [0.4 / np.sqrt(count)] * count
+    used = count - left_out
+    quiet = [None] * left_out + [0.4 / np.sqrt(used)] * used
     changed["cross_validation"] = {
         "folds": count, "folds_converged": count, "image_moved_mm": quiet, "stated_mm": 0.4,
     }  # fmt: skip

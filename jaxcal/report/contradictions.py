@@ -198,11 +198,13 @@ def _from_resampling(record: dict[str, Any]) -> list[tuple[float, str]]:
     found: list[tuple[float, str]] = []
     held, drawn = record.get("cross_validation"), record.get("bootstrap")
     if held is not None and held["folds"] == held["folds_converged"]:
-        moved = [by for by in held["image_moved_mm"] if by is not None]
-        folds, stated = held["folds"], held["stated_mm"]
-        # The jackknife: every image was held out once, together with its fold.
-        each = len(moved) / folds
-        scatter = math.sqrt((folds - 1) / folds * sum(by**2 for by in moved) / each)
+        # The jackknife. All images of a fold are held out together; some folds may hold none that
+        # is in use.
+        moved = {
+            k % held["folds"]: by for k, by in enumerate(held["image_moved_mm"]) if by is not None
+        }
+        folds, stated = max(len(moved), 1), held["stated_mm"]
+        scatter = math.sqrt((folds - 1) / folds * sum(by**2 for by in moved.values()))
         if stated and scatter > SCATTER_TIMES * stated:
             words = f"the calibrations of the cross-validation {_scatter(scatter, stated)}"
             found.append((scatter / stated, words))
