@@ -749,3 +749,15 @@ def test_no_jax(saved, tmp_path):
         [sys.executable, "-c", code, saved, tmp_path], capture_output=True, text=True
     )
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_transform_says_its_numbers_and_sds():
+    sds = np.array([0.1, 0.2, 0.3, *np.radians([0.5, 0.6, 0.7])])
+    known = ImageTransform(
+        np.eye(4), scale_mm_per_px=np.array([0.15, 0.14]), covariance=np.diag(sds**2)
+    )
+    said = repr(known)
+    assert "pixels (mm): 0.15 lateral, 0.14 axial" in said
+    assert "SDs along and about the image's axes: 0.1, 0.2, 0.3 mm; 0.5, 0.6, 0.7 deg" in said
+    assert "must not be used" not in said
+    assert "must not be used" in repr(replace(known, converged=False))
