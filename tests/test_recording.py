@@ -68,6 +68,15 @@ except jaxcal.InputError as error:
 """
 
 
+def test_a_recording_says_what_it_holds_without_its_arrays():
+    recording = jaxcal.simulate_recording(jaxcal.Protocol(images=6, test_images=4))
+    said = repr(recording)
+    assert said.startswith("Recording('")
+    assert "Images(6 used of 6, points, with covariance" in said
+    assert "test=Images(4 used of 4, points" in said
+    assert "array" not in said
+
+
 def test_numbers_of_frames_are_whole():
     given = arrays()
     numbers = np.array([0, 2, 3, 9, 10, 11])

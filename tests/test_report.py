@@ -99,6 +99,8 @@ def test_record_holds_what_the_result_holds(record, result, recording):
     assert record["elevation_sd_mm"] == known
     assert record["scale_mm_per_px"] is None
     assert record["reconstruction_precision_set"] == "test"
+    assert record["reconstruction_precision_images"] == 20
+    assert "over the 20 test images" in " ".join(verdict(record))
     assert record["jaxcal_version"] == jaxcal.__version__
     assert set(record["observability"]) == {
         "condition", "weakest_direction", "weakest_sd_mm", "known_only_from_prior", "advice",

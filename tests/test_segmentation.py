@@ -380,8 +380,9 @@ def test_frames_without_answers_are_masked_and_counted():
     distances[4], distances[9, 5:] = np.nan, np.nan
     mask = np.ones(12, bool)
     mask[1] = False
-    images = raw(distances, L14_5, mask=mask)
+    images = raw(distances, L14_5, mask=mask, frame=np.arange(30, 42))
     found = segment(images, L14_5)
+    np.testing.assert_array_equal(found.images.frame, images.frame)
     np.testing.assert_array_equal(np.flatnonzero(found.failed), [4, 9])
     np.testing.assert_array_equal(np.flatnonzero(~found.images.mask), [1, 4, 9])
     assert found.missing[4] == 128

@@ -20,6 +20,7 @@ from jaxcal.cli.main import main
 from jaxcal.data.poses import check_affine, quaternion_from_rotation, rotations_from_quaternions
 from jaxcal.io.itk import itk_from_matrix, itk_text, matrix_from_itk, read_itk, write_itk
 from jaxcal.io.ros import read_ros_yaml
+from jaxcal.io.sequence_files import write_sequence
 from jaxcal.io.serving import TransformServer
 from jaxcal.io.tus_rec import read_scan
 from jaxcal.result.saved import load_calibration
@@ -749,3 +750,26 @@ def test_no_jax(saved, tmp_path):
         [sys.executable, "-c", code, saved, tmp_path], capture_output=True, text=True
     )
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_transform_says_its_numbers_and_sds():
+    sds = np.array([0.1, 0.2, 0.3, *np.radians([0.5, 0.6, 0.7])])
+    known = ImageTransform(
+        np.eye(4), scale_mm_per_px=np.array([0.15, 0.14]), covariance=np.diag(sds**2)
+    )
+    said = repr(known)
+    assert "pixels (mm): 0.15 lateral, 0.14 axial" in said
+    assert "SDs along and about the image's axes: 0.1, 0.2, 0.3 mm; 0.5, 0.6, 0.7 deg" in said
+    assert "must not be used" not in said
+    assert "must not be used" in repr(replace(known, converged=False))
+
+
+def test_a_report_and_a_sequence_are_told_what_to_name_instead(tmp_path, capsys):
+    known = random_transform()
+    known.save(tmp_path / "calibration.json")
+    assert main(["apply", str(tmp_path), "--pixel", "1", "2"]) == 2
+    assert "is a folder: name the calibration.json in it" in capsys.readouterr().err
+    write_sequence(tmp_path / "new.igs.mha", {("Probe", "Tracker"): np.eye(4)[None]}, np.zeros(1))
+    command = ["apply", str(tmp_path / "calibration.json"), str(tmp_path / "new.igs.mha")]
+    assert main(command) == 2
+    assert "no points: import it with points (jaxcal import)" in capsys.readouterr().err

@@ -127,8 +127,14 @@ def _read(source: str, quaternion, pose_units, skip_invalid: bool):
         used = images.mask
         which = "image", used.nonzero()[0].tolist()
         return images.measurements[used], images.poses[used], images.kind, which
+    from jaxcal.io.sources import SEQUENCES, kind_of
     from jaxcal.io.text import read_pose_table
 
+    if kind_of(source) in SEQUENCES:
+        raise InputError(
+            f"{source}: holds frames or poses, but no points: import it with points (jaxcal "
+            "import), and apply the calibration to the recording"
+        )
     table = read_pose_table(
         source, quaternion=quaternion, pose_units=pose_units, skip_invalid=skip_invalid
     )

@@ -83,6 +83,14 @@ class Images:
     def __len__(self) -> int:
         return len(self.poses)
 
+    def __repr__(self) -> str:
+        """Number and kind of the images, and what is known of each; not the arrays."""
+        optional = ("covariance", "max_elevation", "amplitude", "time", "time_of_flight", "frame")
+        known = [name for name in optional if getattr(self, name) is not None]
+        sized = "" if self.spacing_mm is None else f", spacing_mm={self.spacing_mm.tolist()}"
+        more = f", with {', '.join(known)}" if known else ""
+        return f"Images({int(self.mask.sum())} used of {len(self)}, {self.kind}s{sized}{more})"
+
 
 @dataclass(frozen=True, eq=False)
 class Truth:
@@ -131,6 +139,13 @@ class Recording:
 
     def __len__(self) -> int:
         return len(self.calibration)
+
+    def __repr__(self) -> str:
+        """What it holds, without the arrays."""
+        test = "" if self.test is None else f", test={self.test}"
+        truth = "" if self.truth is None else ", with truth"
+        probe = "" if self.probe is None else f", probe={self.probe}"
+        return f"Recording({self.source!r}, {self.calibration}{test}{truth}{probe})"
 
 
 def joined(first: Recording, second: Recording) -> Recording:

@@ -120,6 +120,7 @@ def calibration_record(
         **certificate_record(answer, recording),
         "reconstruction_precision_mm": _precision(answer, images),
         "reconstruction_precision_set": "calibration" if tested is None else "test",
+        "reconstruction_precision_images": int(np.sum(images.mask)),
         "scale_mm_per_px": answer.scale_mm_per_px,
         "face_offset_mm": transform.face_offset_mm,
         "range_factor": transform.range_factor,

@@ -201,13 +201,14 @@ def scatter(record: dict[str, Any]) -> list[str]:
     precision = record["reconstruction_precision_mm"]
     left_out = record["robust"] and record["outliers"]
     of_calibration = record["reconstruction_precision_set"] == "calibration"
+    tested = "" if of_calibration else f"{record['reconstruction_precision_images']} "
     counted = " (those left out included)" if left_out and of_calibration else ""
     shown = (
         ""
         if precision is None
         else (
-            f"; reconstruction precision (Eq. 8) over the {record['reconstruction_precision_set']} "
-            f"images{counted}: {_mm(precision)}"
+            f"; reconstruction precision (Eq. 8) over the {tested}"
+            f"{record['reconstruction_precision_set']} images{counted}: {_mm(precision)}"
         )
     )
     ranked = sorted(found["scatter_share"].items(), key=lambda item: -(item[1] or 0.0))

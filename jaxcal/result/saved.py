@@ -227,6 +227,8 @@ def load_calibration(path: str | os.PathLike[str]) -> ImageTransform:
     name = path_name(path)
     lower = name.lower()
     with naming(path):
+        if os.path.isfile(os.path.join(name, "calibration.json")):
+            raise FormatError("is a folder: name the calibration.json in it")
         if lower.endswith(".xml"):
             from jaxcal.io.plus import read_transform
 

@@ -123,6 +123,22 @@ class ImageTransform:
         if self.error_mm is not None and not math.isfinite(self.error_mm):
             object.__setattr__(self, "error_mm", None)
 
+    def __repr__(self) -> str:
+        """The transform, the pixel size and the SDs; not the covariances."""
+        shown = np.array2string(self.image_plane_to_probe, precision=4, suppress_small=True)
+        lines = [f"ImageTransform of {self.source}", f"image_plane_to_probe (mm):\n{shown}"]
+        if self.scale_mm_per_px is not None:
+            lateral, axial = self.scale_mm_per_px
+            lines.append(f"pixels (mm): {lateral:.6g} lateral, {axial:.6g} axial")
+        if self.covariance is not None:
+            sd = np.sqrt(self.covariance.diagonal())
+            along = ", ".join(f"{each:.3g}" for each in sd[:3])
+            about = ", ".join(f"{each:.3g}" for each in np.degrees(sd[3:]))
+            lines.append(f"SDs along and about the image's axes: {along} mm; {about} deg")
+        if self.converged is False:
+            lines.append("must not be used")
+        return "\n".join(lines)
+
     def check_usable(self) -> None:
         """Refuse to hand on a calibration that must not be used.
 

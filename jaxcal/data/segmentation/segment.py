@@ -212,6 +212,7 @@ def segment(
         amplitude=images.amplitude,
         time=images.time,
         time_of_flight=times,
+        frame=images.frame,
         minimum=0,
     )
     missing = np.where(used, probe.elements - lines, 0)
