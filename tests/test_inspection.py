@@ -155,6 +155,26 @@ def test_an_image_whose_range_is_off_is_a_suspect():
     assert "or suspicious" in str(ring.get_label())
 
 
+def test_images_that_are_as_noisy_as_their_covariances_say_are_no_outliers():
+    """Every third image is ten times as noisy; a wrong click is still named."""
+    data = problem(5, images=48, elevation_mm=0.5, noise_mm=0.5)
+    noisy = np.arange(48) % 3 == 0
+    sd = np.where(noisy, 10.0, 1.0)[:, None] * np.array([0.2, 0.1])
+    points = np.array(data.measurements) + sd * np.random.default_rng(5).normal(size=(48, 2))
+    covariance = jnp.asarray(sd[:, :, None] ** 2 * np.eye(2))
+    data = replace(data, measurements=jnp.asarray(points))
+    # With common SDs nothing is known of them, and some stand out.
+    assert np.asarray(jaxcal.calibrate(data).outlier)[noisy].sum() > 2
+    found = jaxcal.calibrate(replace(data, covariance=covariance))
+    assert found.offset_law is not None
+    assert float(found.offset_law.own_probability) > 0.9
+    assert not np.asarray(found.outlier).any()
+    points[7, 0] += 5.0
+    wrong = replace(data, measurements=jnp.asarray(points), covariance=covariance)
+    found = jaxcal.calibrate(wrong, prior="gaussian")
+    assert np.flatnonzero(np.asarray(found.outlier)).tolist() == [7]
+
+
 def test_complaints_are_warnings_in_words():
     data = problem(1, images=40, elevation_mm=1.0, noise_mm=0.5)
     result = jaxcal.calibrate(data, "conventional")

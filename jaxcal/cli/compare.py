@@ -18,7 +18,7 @@ MOST_FILES = 100
 """Most calibrations that are compared at once, each with each."""
 
 
-@click.command(short_help="Compare calibrations of one probe: do they agree?")
+@click.command(short_help="Say whether calibrations of one probe agree.")
 @click.argument("calibrations", type=click.Path(), metavar="CAL CAL ...", nargs=-1, required=True)
 @click.option(
     "--pixel",

@@ -2,7 +2,9 @@
 
 *Images.* Each image's errors under the fit to the images in use, in robust SDs. Lateral errors of
 deep images count less, since an array's lateral errors grow with the range
-(:mod:`jaxcal.solvers.consensus`).
+(:mod:`jaxcal.solvers.consensus`), and so do errors of images that are less accurate than most by
+their own covariances, if the fit weighs by these. (Which images ``robust`` leaves out is decided
+before the fit, without covariances.)
 
 *Noise model.* If lateral, range and elevational errors are Gaussian, independent and of one size,
 then statistics of the standardised residuals follow known laws, whatever the data. Five statistics
@@ -24,13 +26,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxcal.diagnostics.image_errors import ImageErrors, Whitened, error_sd, motion, quadratic
+from jaxcal.diagnostics.image_errors import (
+    ImageErrors,
+    Whitened,
+    error_sd,
+    motion,
+    own_covariance,
+    quadratic,
+)
 from jaxcal.diagnostics.sd_by_place import relative_sd
 from jaxcal.diagnostics.uncertainty import Uncertainty, inverses
 from jaxcal.model.thresholds import CUT, FEW_IMAGES, FEWEST_IMAGES, MAD, RELATIVE_FLOOR
 from jaxcal.model.unknowns import block_slice, further_derivatives, measured
 from jaxcal.result.findings import Inspection
-from jaxcal.runtime.array_types import Bool, Float
+from jaxcal.runtime.array_types import AnyArray, Bool, Float
 from jaxcal.solvers.plan import TUNED
 
 if TYPE_CHECKING:
@@ -65,7 +74,9 @@ def inspect(
         eps: relative rounding of the arithmetic that solved them.
     """
     kept = np.asarray(answer.mask, float)
-    studentised = studentised_errors(seen, kept, eps)
+    tuned = answer.prior in TUNED and answer.data == "points"
+    own = own_covariance(answer, seen.problem) if tuned and not answer.robust else None
+    studentised = studentised_errors(seen, kept, eps, own)
     if answer.robust:
         outlier = seen.mask * (1 - kept)
     else:
@@ -74,7 +85,7 @@ def inspect(
         )
         outlier = seen.mask * judged[:, None] * stands_out(studentised, kept)
     residual = seen.errors
-    if answer.prior in TUNED and answer.data == "points":
+    if tuned:
         whitened = Whitened.of(answer, shifted)
         left = np.maximum(1 - whitened.leverage(uncertainty.inverse), 0.05)
         residual = whitened.errors / np.sqrt(left)
@@ -85,9 +96,19 @@ def inspect(
 
 
 def studentised_errors(
-    seen: ImageErrors, kept: Float[Array, "k n"], eps: float
+    seen: ImageErrors,
+    kept: Float[Array, "k n"],
+    eps: float,
+    own: Float[AnyArray, "k n 2 2"] | None = None,
 ) -> Float[Array, "k n 3"]:
-    """Every image's errors under the fit to the kept ones, in robust SDs, leverage corrected."""
+    """Every image's errors under the fit to the kept ones, in robust SDs, leverage corrected.
+
+    Args:
+        seen: the images.
+        kept: 1 for images in use.
+        eps: relative rounding.
+        own: covariances of lateral position and range in any units, or None: all are alike.
+    """
     blocks, problem = seen.blocks, seen.problem
     rigid = [name for name in blocks if name in ("translation", "rotation", "point", "scale")]
     columns = np.concatenate([np.r_[block_slice(blocks, name)] for name in rigid])
@@ -95,7 +116,11 @@ def studentised_errors(
     axial = np.where(seen.mask > 0, np.asarray(problem.measurements)[..., 1], 1.0)
     distance = axial * np.asarray(problem.spacing)[:, 1:] + np.asarray(problem.face_offset)[:, None]
     beyond = np.maximum(distance / medians(distance[..., None], seen.mask), 1.0)
-    by = np.stack([np.where(seen.mask > 0, beyond, 1.0), *[np.ones_like(beyond)] * 2], axis=-1)
+    by = np.stack([beyond, *[np.ones_like(beyond)] * 2], axis=-1)
+    if own is not None:
+        sd = np.sqrt(np.diagonal(np.asarray(own), axis1=-2, axis2=-1))
+        by[..., :2] = np.maximum(by[..., :2], sd / medians(sd, kept)[:, None])
+    by = np.where(seen.mask[..., None] > 0, by, 1.0)
     errors, rows = seen.errors / by, seen.rows[..., columns] / by[..., None]
 
     # The unknowns' degrees of freedom are shared equally by the three components.
