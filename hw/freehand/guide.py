@@ -3,8 +3,8 @@
 An image is taken automatically once the probe has been held still for a moment, if it shows a
 credible target and differs from the images before: another orientation, or the target elsewhere in
 the image (and then the pose, too, must differ: the target rests). Its pose is the mean over that
-moment. The person is told what is still missing: parts of
-the image where the target has not been, and turns of the probe, also about a second axis.
+moment. The person is told what is still missing: parts of the image where the target has not been,
+and turns of the probe, also about a second axis.
 """
 
 from __future__ import annotations

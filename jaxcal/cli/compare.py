@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
@@ -76,25 +77,24 @@ def compare(
 
 
 def _record(first: str, second: str, found: Comparison) -> dict[str, Any]:
-    def number(value: float) -> float | None:
-        return value if value == value else None
+    from jaxcal.runtime.arrays import finite_or_none
 
     return {
         "first": first,
         "second": second,
         "points": found.points.tolist(),
         "apart_mm": found.apart_mm.tolist(),
-        "expected_mm": [number(value) for value in found.expected_mm.tolist()],
+        "expected_mm": [finite_or_none(value) for value in found.expected_mm],
         "rms_mm": found.rms_mm,
-        "expected_rms_mm": number(found.expected_rms_mm),
-        "limit_95_mm": number(found.limit_mm),
+        "expected_rms_mm": finite_or_none(found.expected_rms_mm),
+        "limit_95_mm": finite_or_none(found.limit_mm),
         "rotation_deg": found.rotation_deg,
         "agree": found.agree,
     }
 
 
 def _millimetres(value: float) -> str:
-    return f"{value:.2f}" if value == value else "-"
+    return "-" if math.isnan(value) else f"{value:.2f}"
 
 
 def _table(*headings: str) -> Table:
