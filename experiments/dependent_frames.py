@@ -2,9 +2,13 @@
 
 Holds: k poses with m frames each, 60 in all; every frame adds 0.05 mm of jitter to pose and point,
 errors and offset belong to the hold. Sweeps: 20 frames a second of a probe that moves slowly, with
-offsets (and a part of the other errors) that change over about a second. Each trial is calibrated
-twice: with every frame as an image of its own, and as ``jaxcal.calibrate`` does it, with one image
-for each different pose and, of a sweep, every so many (:mod:`jaxcal.calibration.dependence`).
+offsets (and a part of the other errors) that change over about a second. Paths: 24 to 100 frames,
+0.3 s apart, of the same movement (or of one in random order), with offsets and errors that have a
+given correlation in successive frames. Each trial is calibrated twice: with every frame as an image
+of its own (``jaxcal.calibrate_batch``), and by ``jaxcal.calibrate``, which takes one image for each
+different pose and, of a sweep, every so many (:mod:`jaxcal.calibration.dependence`), and widens the
+covariance for errors that are alike in successive images
+(:mod:`jaxcal.calibration.serial_correlation`).
 
 The table has the coverage of the 95 % intervals of X's six parameters (the mean and the lowest),
 the root mean square errors of X and what was stated, the share of trials that would be called good
@@ -18,15 +22,13 @@ Seed 20261122; trial t of condition k has the generator (seed, k, t).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from common import arguments, batch_of, machine, right_errors, write_table
 from scipy.spatial.transform import Rotation
 
 import jaxcal
-from jaxcal.calibration.dependence import independent
-from jaxcal.data.recording import make_images
 from jaxcal.report.accuracy import FAIR_MM, GOOD_MM
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.jax_cache import enable_compilation_cache
@@ -102,7 +104,28 @@ def held(holds: int, frames: int, rng: np.random.Generator) -> Frames:
 def swept(seconds: float, alike_s: float, rng: np.random.Generator) -> Frames:
     """A probe that moves slowly, with errors alike over so many seconds."""
     count = round(RATE_HZ * seconds)
-    time = np.arange(count) / RATE_HZ
+    share = np.exp(-1 / (RATE_HZ * alike_s))
+    rotations, q = moved(np.arange(count) / RATE_HZ, rng)
+    q[:, 1] = 0.6 * OFFSET_MM * slow(count, share, rng)
+    transform, poses = placed(q, rotations, rng)
+    drifting = np.stack([slow(count, share, rng) for _ in range(2)], axis=1)
+    errors = 0.8 * rng.normal(size=(count, 2)) + 0.6 * drifting
+    return Frames(jittered(poses, rng), seen(q) + NOISE_MM * errors, transform)
+
+
+def along(count: int, correlation: float, rng: np.random.Generator, shuffled=False) -> Frames:
+    """Frames of a moving probe whose errors have this correlation in successive ones."""
+    rotations, q = moved(0.3 * np.arange(count), rng)
+    order = rng.permutation(count) if shuffled else np.arange(count)
+    rotations, q = rotations[order], q[order]
+    errors = np.stack([slow(count, correlation, rng) for _ in range(3)], axis=1)
+    q[:, 1] = 0.6 * OFFSET_MM * errors[:, 2]
+    transform, poses = placed(q, rotations, rng)
+    return Frames(poses, seen(q) + NOISE_MM * errors[:, :2], transform)
+
+
+def moved(time: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Rotations, and where the target lies in the mid-plane, at times (s) of a smooth movement."""
 
     def path(size: float) -> np.ndarray:
         periods, phases = rng.uniform(6, 20, 2), rng.uniform(0, 2 * np.pi, 2)
@@ -110,12 +133,7 @@ def swept(seconds: float, alike_s: float, rng: np.random.Generator) -> Frames:
         return size * waves @ [0.7, 0.5]
 
     rotations = Rotation.from_rotvec(np.stack([path(0.35) for _ in range(3)], axis=1))
-    offset = 0.6 * OFFSET_MM * slow(count, alike_s, rng)
-    q = np.stack([path(20), offset, 45 + path(22)], axis=1)
-    transform, poses = placed(q, rotations.as_matrix(), rng)
-    drifting = np.stack([slow(count, alike_s, rng) for _ in range(2)], axis=1)
-    errors = 0.8 * rng.normal(size=(count, 2)) + 0.6 * drifting
-    return Frames(jittered(poses, rng), seen(q) + NOISE_MM * errors, transform)
+    return rotations.as_matrix(), np.stack([path(20), 0 * time, 45 + path(22)], axis=1)
 
 
 def seen(q: np.ndarray) -> np.ndarray:
@@ -123,9 +141,8 @@ def seen(q: np.ndarray) -> np.ndarray:
     return np.stack([q[:, 0], np.hypot(q[:, 1], q[:, 2])], axis=1)
 
 
-def slow(count: int, alike_s: float, rng: np.random.Generator) -> np.ndarray:
-    """Standard normal numbers with an exponential correlation in time."""
-    share = np.exp(-1 / (RATE_HZ * alike_s))
+def slow(count: int, share: float, rng: np.random.Generator) -> np.ndarray:
+    """Standard normal numbers, successive ones with a correlation of this share."""
     steps = rng.normal(size=count)
     values = np.empty(count)
     values[0] = steps[0]
@@ -143,6 +160,16 @@ CONDITIONS: dict[str, Callable[[np.random.Generator], Frames]] = {
     "sweep 30 s, alike for 0.5 s": lambda rng: swept(30, 0.5, rng),
     "sweep 30 s, alike for 1 s": lambda rng: swept(30, 1.0, rng),
     "sweep 60 s, alike for 1 s": lambda rng: swept(60, 1.0, rng),
+    "path of 24, correlation 0": lambda rng: along(24, 0.0, rng),
+    "path of 24, correlation 0.6": lambda rng: along(24, 0.6, rng),
+    "path of 40, correlation 0": lambda rng: along(40, 0.0, rng),
+    "path of 40, correlation 0.3": lambda rng: along(40, 0.3, rng),
+    "path of 40, correlation 0.6": lambda rng: along(40, 0.6, rng),
+    "path of 100, correlation 0": lambda rng: along(100, 0.0, rng),
+    "path of 100, correlation 0.3": lambda rng: along(100, 0.3, rng),
+    "path of 100, correlation 0.6": lambda rng: along(100, 0.6, rng),
+    "random order of 40, correlation 0": lambda rng: along(40, 0.0, rng, shuffled=True),
+    "random order of 40, correlation 0.6": lambda rng: along(40, 0.6, rng, shuffled=True),
 }
 
 
@@ -154,25 +181,49 @@ def stated_tre(results: Calibration) -> np.ndarray:
     return np.sqrt(np.mean(found**2, axis=-1))
 
 
-def row_of(result: Calibration, truth: np.ndarray) -> list[object]:
+@dataclass(frozen=True)
+class Answers:
+    """What the table needs of answers, each with a leading axis."""
+
+    converged: np.ndarray
+    images: np.ndarray
+    transform: np.ndarray
+    half_95: np.ndarray
+    half_99: np.ndarray
+    variance: np.ndarray
+    tre: np.ndarray
+
+    @classmethod
+    def of(cls, result: Calibration) -> Answers:
+        """Those of a calibration, of one problem or a batch."""
+        answer = result.numpy()
+        half_95, half_99 = (jaxcal.transform_intervals(answer, level) for level in (0.95, 0.99))
+        variance = np.diagonal(answer.covariance, axis1=-2, axis2=-1)
+        images = np.sum(answer.mask, axis=-1)
+        found = (answer.image_to_probe, half_95, half_99, variance, stated_tre(answer))
+        alone = answer.image_to_probe.ndim == 2
+        whole = (np.asarray(result.converged), images, *found)
+        return cls(*(np.asarray(each)[None] if alone else np.asarray(each) for each in whole))
+
+
+def row_of(answers: list[Answers], truth: np.ndarray) -> list[object]:
     """What the table says of some answers."""
-    answer = result.numpy()
-    converged = np.asarray(result.converged)
-    error = right_errors(np.asarray(answer.image_to_probe), truth)[converged]
-    kept = answer[converged]
-    inside, outside = (
-        np.abs(error) <= jaxcal.transform_intervals(kept, 0.95),
-        (np.abs(error) > jaxcal.transform_intervals(kept, 0.99)).any(axis=1),
-    )
-    variance = np.diagonal(np.asarray(kept.covariance), axis1=1, axis2=2)
+    joined = {
+        field.name: np.concatenate([getattr(each, field.name) for each in answers])
+        for field in fields(Answers)
+    }
+    converged = joined["converged"]
+    error = right_errors(joined["transform"], truth)[converged]
+    inside = np.abs(error) <= joined["half_95"][converged]
+    outside = (np.abs(error) > joined["half_99"][converged]).any(axis=1)
+    variance, worst = joined["variance"][converged], joined["tre"][converged]
     stated = np.sqrt(variance.reshape(-1, 2, 3).sum(axis=2)) * [1.0, np.degrees(1.0)]
-    worst = stated_tre(kept)
     actual = np.sqrt((error.reshape(-1, 2, 3) ** 2).sum(axis=2)) * [1.0, np.degrees(1.0)]
     error_mm, error_deg = np.sqrt(np.mean(actual**2, axis=0))
     stated_mm, stated_deg = np.sqrt(np.mean(stated**2, axis=0))
     covered = inside.mean(axis=0)
     return [
-        int((~converged).sum()), float(np.mean(np.sum(answer.mask, axis=1))),
+        int((~converged).sum()), float(np.mean(joined["images"])),
         float(covered.mean()), float(covered.min()), float(covered.max()),
         float(error_mm), float(stated_mm), float(error_deg), float(stated_deg),
         float(np.mean(worst <= GOOD_MM)), float(np.mean((worst <= GOOD_MM) & outside)),
@@ -187,29 +238,24 @@ def main() -> None:
     rows: list[list[object]] = []
     for condition, (name, make) in enumerate(CONDITIONS.items()):
         sets = [make(np.random.default_rng([SEED, condition, t])) for t in range(trials)]
-        counted: list[tuple[np.ndarray, np.ndarray]] = []
-        truth: list[np.ndarray] = []
+        # Every frame as an image takes longest, and a quarter of the trials shows what comes of it.
+        some = sets[: trials // 4]
+        every = batch_of([(one.poses, one.points) for one in some], len(some[0].poses))
+        found = {"every frame": [Answers.of(jaxcal.calibrate_batch(every, chunk=40))]}
+        found["calibrate"], answered = [], []
         for one in sets:
             try:
-                images, found = independent(make_images(one.poses, one.points))
+                result = jaxcal.calibrate(jaxcal.Problem.from_arrays(one.poses, one.points))
             except jaxcal.InputError:
                 continue
-            counted.append((images.poses[found.keep], images.measurements[found.keep]))
-            truth.append(one.image_to_probe)
-        # Every frame as an image takes longest, and a quarter of the trials shows what comes of it.
-        every = [(one.poses, one.points) for one in sets[: trials // 4]]
-        truths = np.array([one.image_to_probe for one in sets[: trials // 4]])
-        for how, tried, some, those in (
-            ("every frame", len(every), every, truths),
-            ("one image a pose", trials, counted, np.array(truth)),
-        ):
-            head: list[object] = [name, how, tried, tried - len(some)]
+            found["calibrate"].append(Answers.of(result))
+            answered.append(one)
+        for (how, answers), those in zip(found.items(), (some, answered), strict=True):
+            tried = len(sets) if how == "calibrate" else len(some)
             rest: list[object] = [""] * (len(HEADER) - 4)
-            if some:
-                # Padded to few sizes, each of which is a program.
-                most = -(-max(len(poses) for poses, _ in some) // 16) * 16
-                rest = row_of(jaxcal.calibrate_batch(batch_of(some, most), chunk=40), those)
-            rows.append(head + rest)
+            if answers:
+                rest = row_of(answers, np.array([one.image_to_probe for one in those]))
+            rows.append([name, how, tried, tried - len(those), *rest])
             print(*rows[-1], flush=True)
     write_table(folder / "dependent_frames.csv", HEADER, rows)
     print(machine())

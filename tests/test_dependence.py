@@ -12,6 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.fft
+import scipy.signal
 from scipy.spatial.transform import Rotation
 
 import jaxcal
@@ -23,12 +25,7 @@ from jaxcal.calibration.dependence import (
     same_pose,
 )
 from jaxcal.calibration.resampling import relative_twist
-from jaxcal.calibration.serial_correlation import (
-    CHANCE,
-    _covariances,
-    believed_correlation,
-    widened,
-)
+from jaxcal.calibration.serial_correlation import _cosine_transform, _covariances, widened
 from jaxcal.data.problem import Channels
 from jaxcal.data.recording import make_images
 from jaxcal.diagnostics.influence import influence_of, whitened_errors
@@ -161,14 +158,49 @@ def test_correlation_time(frames, alike):
     assert np.median(times) == pytest.approx(2 * alike, rel=0.25)
 
 
-def test_independent_errors_are_not_believed_to_be_correlated():
-    rng = np.random.default_rng(7)
-    found = np.array([believed_correlation(rng.normal(size=(54, 3))) for _ in range(400)])
-    # Beyond CHANCE lie 1.8 % of them.
-    assert (found > 0).mean() < 0.03
-    assert CHANCE == 2.1
-    drifting = np.stack([np.convolve(rng.normal(size=80), np.ones(8), "valid")] * 3, axis=1)
-    assert (believed_correlation(drifting) > 0.6).all()
+def _linear_answers(order, correlation: float, share: float = 1.0):
+    """Errors of answers from 40 images on a slow path, in their SDs, and how these were widened.
+
+    A share of the variance of every kind of error has this correlation in successive images.
+    """
+    rng, count = np.random.default_rng(7), 40
+    errors, widening = [], []
+    for _ in range(60):
+        phase, period = rng.uniform(0, 2 * np.pi, (3, 6)), rng.uniform(20, 60, (3, 6))
+        rows = np.sin(2 * np.pi * np.arange(count)[:, None, None] / period + phase)[order(rng)]
+        steps = rng.normal(size=(count, 3)) * np.sqrt(1 - correlation**2)
+        steps[0] /= np.sqrt(1 - correlation**2)
+        drift = scipy.signal.lfilter([1.0], [1.0, -correlation], steps, axis=0)
+        own = rng.normal(size=(count, 3))
+        drawn = np.sqrt(share) * drift + np.sqrt(1 - share) * own
+        inverse = np.linalg.inv(np.einsum("mkp,mkq->pq", rows, rows))
+        moved = inverse @ np.einsum("mkp,mk->p", rows, drawn)
+        before, after = _covariances(drawn - rows @ moved, rows, np.zeros(6))
+        np.testing.assert_allclose(before, inverse, rtol=1e-9)
+        errors.append(moved / np.sqrt(np.diag(after)))
+        widening.append(np.sqrt(np.diag(after) / np.diag(before)))
+    return np.array(errors), np.array(widening)
+
+
+def test_the_covariance_holds_along_a_slow_path_whatever_the_correlation():
+    for correlation, share in [(0.0, 1.0), (0.3, 1.0), (0.6, 1.0), (0.8, 0.5)]:
+        errors, widening = _linear_answers(lambda rng: slice(None), correlation, share)
+        assert (widening >= 1 - 1e-9).all()
+        assert 0.9 < np.mean(np.abs(errors) < 1.96) < 0.99, (correlation, share)
+        assert 0.75 < np.sqrt(np.mean(errors**2)) < 1.25, (correlation, share)
+
+
+def test_errors_hardly_widen_a_covariance_where_poses_change_at_random():
+    _, independent_errors = _linear_answers(lambda rng: rng.permutation(40), 0.0)
+    _, correlated_errors = _linear_answers(lambda rng: rng.permutation(40), 0.6)
+    assert independent_errors.mean() < 1.04
+    assert correlated_errors.mean() < 1.3
+
+
+def test_cosine_transform_is_scipys():
+    values = np.random.default_rng(1).normal(size=(9, 3, 4))
+    expected = scipy.fft.dct(values, axis=0, norm="ortho")
+    np.testing.assert_allclose(_cosine_transform(values), expected, atol=1e-14)
 
 
 def test_held_probes_are_covered_and_never_good(frames):

@@ -1,22 +1,31 @@
 """Errors that are alike in successive images, and how much they widen the covariance.
 
-A least-squares answer moves by dx = S^-1 sum_i J_i' e_i, with J_i the rows of image i and e_i its
-errors, both in SDs, and S = sum_i J_i' J_i. If errors of one kind k (lateral, range, elevational)
-have correlation rho_k^|i - j| between images i and j, its covariance is
+A least-squares answer moves by dx = S^-1 sum_k J_k' e_k, with J_k the rows of all images for one
+kind k of error (lateral, range, elevational), e_k these errors, both in SDs, and S the sum of
+J_k' J_k. If the errors of kind k have the covariance C_k over the images, that of the answer is
 
-    S^-1 (sum_k sum_ij rho_k^|i - j| J_ik' J_jk) S^-1
+    S^-1 (sum_k J_k' C_k J_k) S^-1
 
 instead of S^-1. How much larger this is depends on the order of the poses: where the poses change
 at random, a drift hardly matters; where they change as slowly as the errors, it dominates.
 
-Each rho_k is the correlation of successive residuals, corrected for leverage. With z its value in
-SDs, it is multiplied by 1 - (``CHANCE`` / z)^2, and is zero where z is below ``CHANCE``; for
-independent errors z exceeds ``CHANCE`` in 2 % of recordings, for each kind of error. So independent
-data keep their covariance, and the correction grows continuously. It never makes an answer more
+A share a of the variance of each kind is correlated by rho^|i - j| between images i and j, the rest
+is independent. The residuals do not show C_k as it is, since the fit absorbs slow errors more than
+quick ones. So every pair (rho, a) of a grid is weighed by its restricted likelihood given those
+residuals (profiled over the variance), times a prior: half for no correlation, the other half
+spread evenly over the grid. The other kinds enter with their mean weights, in turn. C_k is then the
+weighed mean, which is the law of total variance, since every pair has the same estimate. So errors
+that look independent change the covariance by one to two percent if the poses change at random, and
+there is no threshold. Few images along a slow path cannot tell a drift from a movement: their
+covariance grows even if their errors are independent. The correction never makes an answer more
 certain. The information P of priors on sound speed and delay is added to both sums.
 
-References: White 1980; Newey and West 1987 (covariances under dependent errors). Here one
-parameter for each kind of error describes the correlation at all lags.
+The cosine transform of a stationary series has nearly independent coefficients, whose variances are
+the spectral density. So no matrix of all images is formed: C_k is diagonal there.
+
+References: Patterson and Thompson 1971 (restricted likelihood); White 1980 and Liang and Zeger 1986
+(covariances under dependent errors); Ahmed, Natarajan and Rao 1974 (cosine transform of such
+series).
 """
 
 from __future__ import annotations
@@ -35,14 +44,23 @@ from jaxcal.runtime.arrays import like, map_arrays
 if TYPE_CHECKING:
     from jaxcal.result.calibration import Calibration, Medium
 
-CHANCE = 2.1
-"""SDs that the correlation of successive residuals must exceed to be believed."""
+CORRELATIONS = np.arange(0.04, 1.0, 0.08)
+"""Correlations of the correlated part of successive errors that are weighed."""
+
+SHARES = np.array([1 / 3, 2 / 3, 1.0])
+"""Shares of the variance that are correlated."""
+
+INDEPENDENT = 0.5
+"""Prior probability that errors of one kind are independent."""
 
 FEWEST_SUCCESSIVE = 20
 """With fewer used images the correlation is not estimated."""
 
-LARGEST_CORRELATION = 0.98
-"""Largest correlation of successive errors that is assumed."""
+NEGLIGIBLE = 0.01
+"""Errors with less than this share of the variance that they are given tell of no correlation."""
+
+ROUNDS, STEPS = 3, 3
+"""Rounds over the kinds of error, and steps to the variance in each."""
 
 
 def widened(result: Calibration) -> Calibration:
@@ -52,8 +70,8 @@ def widened(result: Calibration) -> Calibration:
         result: of one problem, with concrete values.
 
     Returns:
-        The same object where there is no sign that the errors are correlated. Calibrations from
-        channels or with bounded offsets are returned unchanged.
+        Calibrations from channels, with bounded offsets or with fewer than ``FEWEST_SUCCESSIVE``
+        images are returned unchanged.
     """
     if result.data != "points" or result.prior == "bounded" or result.problem is None:
         return result
@@ -64,10 +82,7 @@ def widened(result: Calibration) -> Calibration:
         return result
     answer = map_arrays(lambda leaf: np.asarray(leaf)[None], result)
     whitened = whitened_errors(answer)
-    found = _covariances(whitened.errors, whitened.rows, medium_prior(answer)[0])
-    if found is None:
-        return result
-    before, after = found
+    before, after = _covariances(whitened.errors, whitened.rows, medium_prior(answer)[0])
     linearisation = result.linearisation
     # The information about all unknowns changes in the same proportion.
     whole = _stretched(np.linalg.inv(np.asarray(linearisation.information, float)), before, after)
@@ -101,26 +116,16 @@ def _covariances(
     errors: Float[np.ndarray, "m 3"],
     rows: Float[np.ndarray, "m 3 p"],
     precision: Float[np.ndarray, " p"],
-) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "p p"]] | None:
-    """Covariances of the unknowns without and with the correlation; None where there is none."""
-    count = len(errors)
-    each = np.einsum("mkp,mkq->kpq", rows, rows)
-    prior = np.diag(precision)
+) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "p p"]]:
+    """Covariances of the unknowns without and with the correlation."""
+    each, prior = np.einsum("mkp,mkq->kpq", rows, rows), np.diag(precision)
     before = np.linalg.inv(each.sum(axis=0) + prior)
-    leverage = np.einsum("mkp,pq,mkq->mk", rows, before, rows)
-    rho = believed_correlation(errors / np.sqrt(np.maximum(1 - leverage, 0.05)))
-    if not rho.any():
-        return None
+    spectra = _spectra(len(errors))
+    waves = _cosine_transform(np.concatenate([rows, errors[..., None]], axis=2))
     middle = prior
-    for k in range(3):
-        filtered = rows[:, k].copy()
-        for index in range(1, count):
-            filtered[index] += rho[k] * filtered[index - 1]
-        half = filtered.T @ rows[:, k]
-        both = half + half.T - each[k]
-        # The fit absorbs slow errors more than quick ones, so the SD is too small: enlarge it.
-        left = count - np.sum(before * each[k])
-        middle = middle + both * left / max(count - np.sum(before * both), 0.2 * count)
+    for k, factor in enumerate(_factors(waves, spectra, prior)):
+        along = waves[:, k, :-1]
+        middle = middle + (along.T * (factor @ spectra)) @ along
     lower = np.linalg.cholesky(before)
     inner = np.linalg.solve(lower, before @ middle @ before)
     values, vectors = np.linalg.eigh(np.linalg.solve(lower, inner.T))
@@ -128,14 +133,79 @@ def _covariances(
     return before, (turned * np.maximum(values, 1.0)) @ turned.T
 
 
-def believed_correlation(errors: Float[np.ndarray, "m k"]) -> Float[np.ndarray, " k"]:
-    """Correlation of successive images for every kind of error, shrunk to allow for chance."""
-    centred = errors - errors.mean(axis=0)
-    square = np.sum(centred**2, axis=0)
-    successive = np.sum(centred[1:] * centred[:-1], axis=0)
-    rho = successive / np.where(square > 0, square, 1.0)
-    score = np.maximum(rho * np.sqrt(len(errors) - 1), 1e-9)
-    return np.clip(rho * np.maximum(1 - (CHANCE / score) ** 2, 0.0), 0.0, LARGEST_CORRELATION)
+def _cosine_transform(values: Float[np.ndarray, "n k q"]) -> Float[np.ndarray, "n k q"]:
+    """The orthonormal cosine transform (DCT-II) along the first axis."""
+    # That of scipy.fft is the same, but importing it takes longer than a calibration.
+    count = len(values)
+    turn = np.exp(-0.5j * np.pi * np.arange(count) / count)[:, None, None]
+    mirrored = np.concatenate([values, values[::-1]])
+    found = (turn * np.fft.rfft(mirrored, axis=0)[:count]).real / np.sqrt(2 * count)
+    found[0] /= np.sqrt(2)
+    return found
+
+
+def _spectra(count: int) -> Float[np.ndarray, "g n"]:
+    """Variances of the cosine transform of errors with variance 1; the first are independent."""
+    rho, share = CORRELATIONS[:, None, None], SHARES[:, None]
+    density = (1 - rho**2) / (1 - 2 * rho * np.cos(np.pi * np.arange(count) / count) + rho**2)
+    density = density / density.mean(axis=-1, keepdims=True)
+    correlated = (1 - share + share * density).reshape(-1, count)
+    return np.concatenate([np.ones((1, count)), correlated])
+
+
+def _factors(
+    waves: Float[np.ndarray, "n 3 q"], spectra: Float[np.ndarray, "g n"], prior: np.ndarray
+) -> Float[np.ndarray, "3 g"]:
+    """Weight of every spectrum times the variance under it, for every kind of error.
+
+    Args:
+        waves: cosine transforms of the unknowns' rows and, last, of the errors.
+        spectra: of all models of the correlation.
+        prior: (q - 1, q - 1) information about the unknowns.
+
+    Returns:
+        Variances are relative to the one under independence. So a row is (1, 0, 0, ...) where
+        independence is certain.
+    """
+    count, kinds, size = waves.shape
+    weighed = np.array(
+        [[(wave.T / power) @ wave for power in spectra] for wave in waves.transpose(1, 0, 2)]
+    )
+    whole = np.zeros((size, size))
+    whole[:-1, :-1] = prior
+    log_det = np.log(spectra).sum(axis=1)
+    before = np.full(len(spectra), (1 - INDEPENDENT) / (len(spectra) - 1))
+    before[0] = INDEPENDENT
+    weight = np.tile(np.eye(1, len(spectra)), (kinds, 1))
+    variance = np.ones((kinds, len(spectra)))
+
+    def profile(k: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Cost, leverage and weighed squares of the errors of kind k, under all its spectra."""
+        others = np.tensordot(weight / variance, weighed, ((0, 1), (0, 1)))
+        mine = np.tensordot(weight[k] / variance[k], weighed[k], 1)
+        joint = whole + others - mine + weighed[k] / variance[k][:, None, None]
+        information, gradient = joint[:, :-1, :-1], joint[:, :-1, -1:]
+        step = np.linalg.solve(information, gradient)
+        with_error = np.concatenate([-step, np.ones_like(step[:, :1])], axis=1)
+        squares = np.einsum("gpi,gpq,gqi->g", with_error, weighed[k], with_error)
+        leverage = np.trace(np.linalg.solve(information, weighed[k][:, :-1, :-1]), axis1=1, axis2=2)
+        cost = np.linalg.slogdet(information)[1] + joint[:, -1, -1]
+        return cost - np.sum(gradient * step, axis=(1, 2)), leverage / variance[k], squares
+
+    for _ in range(ROUNDS):
+        for k in range(kinds):
+            for _ in range(STEPS):
+                _, leverage, squares = profile(k)
+                variance[k] = squares / np.maximum(count - leverage, 0.1 * count)
+                if not variance[k][0] > NEGLIGIBLE:
+                    break
+            if not variance[k][0] > NEGLIGIBLE:
+                variance[k] = 1.0
+                continue
+            twice = profile(k)[0] + count * np.log(variance[k]) + log_det
+            likelihood = before * np.exp(-0.5 * (twice - twice.min()))
+            weight[k] = likelihood / likelihood.sum()
+    return weight * variance / variance[:, :1]
 
 
 def _stretched(
@@ -143,7 +213,14 @@ def _stretched(
     before: Float[np.ndarray, "p p"],
     after: Float[np.ndarray, "p p"],
 ) -> Float[np.ndarray, "p p"]:
-    """A covariance changed in the same proportion as another one, from before to after."""
-    stretch = np.linalg.cholesky(after) @ np.linalg.inv(np.linalg.cholesky(before))
-    found = stretch @ covariance @ stretch.T
-    return 0.5 * (found + found.T)
+    """A covariance changed in the same proportion as another one, from before to after.
+
+    What it has beyond ``before`` does not come from the errors of single images (the doubt about
+    the mean of the offsets, say), and stays as it is.
+    """
+    lower = np.linalg.cholesky(before)
+    values, vectors = np.linalg.eigh(np.linalg.solve(lower, np.linalg.solve(lower, covariance).T))
+    own = np.linalg.cholesky(after) @ vectors
+    beyond = lower @ vectors
+    found = (own * np.minimum(values, 1.0)) @ own.T
+    return found + (beyond * np.maximum(values - 1.0, 0.0)) @ beyond.T
