@@ -606,9 +606,6 @@ EARLY = "the recorded answer had stopped too early"
 CONVERGES = "it converges, where max_iterations is recorded"
 LOST = "max_iterations, where it had converged; the images do not determine X"
 UNSEARCHED = "its start is no longer searched for; the images do not determine X"
-WIDENED = (
-    "errors that are alike in successive images widen its covariance, since later than recorded"
-)
 
 DIFFERENT: tuple[tuple[str, str, str, str, tuple[int, ...]], ...] = (
     ("points12", "bounded", "batch", ANOTHER, (3,)),
@@ -754,7 +751,6 @@ DIFFERENT: tuple[tuple[str, str, str, str, tuple[int, ...]], ...] = (
     ("curved12", "gaussian, speed and delay", "batch", FLAT, (13,)),
     ("points12", "alternating", "one", UNSEARCHED, (50,)),
     ("points12", "given", "one", LOST, (60,)),
-    ("points24", "conventional", "one", WIDENED, (6,)),
     (
         "points24",
         "alternating",
