@@ -152,7 +152,7 @@ def test_correlation_time(frames, alike):
     """Exponential correlation over ``alike`` images: their integrated time is twice that."""
     rng = np.random.default_rng(alike)
     times = [
-        correlation_time(autocorrelation(frames.slow(3000, alike / frames.RATE_HZ, rng)))
+        correlation_time(autocorrelation(frames.slow(3000, np.exp(-1 / alike), rng)))
         for _ in range(40)
     ]
     assert np.median(times) == pytest.approx(2 * alike, rel=0.25)

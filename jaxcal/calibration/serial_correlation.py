@@ -56,6 +56,9 @@ INDEPENDENT = 0.5
 FEWEST_SUCCESSIVE = 20
 """With fewer used images the correlation is not estimated."""
 
+ROUNDING_MM = 1e-9
+"""Errors with smaller SDs are rounding."""
+
 NEGLIGIBLE = 0.01
 """Errors with less than this share of the variance that they are given tell of no correlation."""
 
@@ -80,13 +83,16 @@ def widened(result: Calibration) -> Calibration:
     used = int(np.sum(np.asarray(result.mask) > 0))
     if not np.isfinite(covariance).all() or used < FEWEST_SUCCESSIVE:
         return result
+    if np.max(np.asarray(result.sigma)) < ROUNDING_MM:
+        return result
     answer = map_arrays(lambda leaf: np.asarray(leaf)[None], result)
     whitened = whitened_errors(answer)
     before, after = _covariances(whitened.errors, whitened.rows, medium_prior(answer)[0])
     linearisation = result.linearisation
     # The information about all unknowns changes in the same proportion.
-    whole = _stretched(np.linalg.inv(np.asarray(linearisation.information, float)), before, after)
-    information = np.linalg.inv(whole)
+    variance = float(linearisation.variance)
+    whole = variance * np.linalg.inv(np.asarray(linearisation.information, float))
+    information = variance * np.linalg.inv(_stretched(whole, before, after))
     wider = _stretched(covariance, before, after)
     return replace(
         result,
