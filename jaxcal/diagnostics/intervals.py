@@ -33,7 +33,14 @@ from scipy import special
 
 from jaxcal import InputError
 from jaxcal.model.image_points import mean_of_squares, point_jacobian
-from jaxcal.model.unknowns import TINY, count_unknowns, in_image, measured, split_further
+from jaxcal.model.unknowns import (
+    TINY,
+    Values,
+    count_unknowns,
+    in_image,
+    measured,
+    split_further,
+)
 from jaxcal.runtime.array_types import AnyArray, Float
 from jaxcal.runtime.arrays import array_module, is_traced
 from jaxcal.runtime.given_values import is_number, real_array
@@ -170,12 +177,16 @@ def range_of_row_zero(
     xp = array_module(calibration)
     face = 0.0 if calibration.problem is None else calibration.problem.face_offset
     one = xp.ones(np.shape(calibration.mask)[:-1])
-    further = calibration.linearisation.further
-    values = {} if further is None else split_further(further, calibration.blocks)
-    values.pop("scale", None)  # of pixels, not of ranges
     # A complex step, since a difference of ranges would have their rounding error.
-    at = measured(0.0, one * (1j * TINY), xp.asarray(face), values)[1]
+    at = measured(0.0, one * (1j * TINY), xp.asarray(face), beside_scale(calibration))[1]
     return xp.asarray(xp.real(at)), xp.asarray(xp.imag(at) / TINY)
+
+
+def beside_scale(calibration: Calibration) -> Values:
+    """The estimated further unknowns but for the scale, which is in ``scale_mm_per_px``."""
+    further = calibration.linearisation.further
+    found = {} if further is None else split_further(further, calibration.blocks)
+    return {name: value for name, value in found.items() if name != "scale"}
 
 
 @traceable

@@ -11,7 +11,7 @@ import jaxcal
 from jaxcal import InputError
 from jaxcal.data.poses import rotation_angle
 from jaxcal.data.recording import Images, Recording, Truth
-from jaxcal.diagnostics.intervals import range_of_row_zero
+from jaxcal.diagnostics.intervals import beside_scale
 from jaxcal.diagnostics.law_words import offset_law
 from jaxcal.diagnostics.metrics import reconstruction_precision
 from jaxcal.diagnostics.misfits import noise_model
@@ -20,6 +20,7 @@ from jaxcal.model.unknowns import (
     TABLE,
     block_slice,
     in_image,
+    measured,
     split_further,
     tangent_names,
     with_prior,
@@ -267,8 +268,6 @@ def _points_mm(images: Images, result: Calibration) -> Float[np.ndarray, "n 2"]:
         scale = result.scale_mm_per_px
         if images.spacing_mm is not None and "scale" not in result.blocks:
             scale = images.spacing_mm
-    points = images.measurements * np.asarray(scale) + [0.0, images.face_offset_mm]
-    # Of the calibration's images, whose face offset may be another one.
-    origin, factor = map(float, range_of_row_zero(result))
-    face = 0.0 if result.problem is None else float(np.asarray(result.problem.face_offset))
-    return points * [1.0, factor] + [0.0, origin - factor * face]
+    lateral, axial = (images.measurements * np.asarray(scale)).T
+    points = measured(lateral, axial, images.face_offset_mm, beside_scale(result))
+    return np.stack(points, axis=1)
