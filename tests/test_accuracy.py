@@ -28,12 +28,19 @@ from jaxcal.diagnostics.intervals import (
     tre_over,
 )
 from jaxcal.model.image_points import point_jacobian
+from jaxcal.model.unknowns import (
+    FURTHER,
+    TABLE,
+    count_unknowns,
+    further_derivatives,
+    measured,
+    stepped,
+)
 from jaxcal.report.accuracy import FAIR_MM, GOOD_MM, region_of, settle
 from jaxcal.report.next_poses import next_poses_sentences
 from jaxcal.report.record import _precision, calibration_record
 from jaxcal.report.tables import calibration_table
 from jaxcal.report.verdict import headline, limits, verdict
-from jaxcal.result.calibration import Medium
 from jaxcal.result.saved import load_calibration
 from jaxcal.result.transform import ImageTransform
 from jaxcal.solvers.closed_form.calibrate import calibrate_closed_form
@@ -508,14 +515,51 @@ def test_precision_is_that_at_the_estimated_sound_speed_and_delay():
     def earlier(images):
         return replace(images, measurements=images.measurements / [1.0, factor] + [0.0, delay_mm])
 
-    nominal = float(np.asarray(result.problem.nominal_sound_speed))
-    medium = Medium(
-        sound_speed_m_s=np.array(factor * nominal), delay_s=np.array(delay_mm / nominal / 1e3)
+    estimated = replace(
+        result,
+        problem=earlier(result.problem),
+        blocks=(*result.blocks, "sound-speed", "delay"),
+        linearisation=replace(result.linearisation, further=np.array([factor, delay_mm])),
     )
-    estimated = replace(result, problem=earlier(result.problem), medium=medium)
     for images in (recording.test, recording.calibration):
         expected = _precision(result, images)
         assert _precision(estimated, earlier(images)) == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("name", [name for name in FURTHER if TABLE[name].in_image])
+def test_a_transform_has_every_unknown_that_moves_an_image_point(name):
+    """Its points, and their derivatives, are those of the model, whatever row the table has."""
+    images = experiment(3, images=24, elevation_mm=1.0).calibration
+    spacing, face = np.array([0.2, 0.1]), 1.5
+    pixels = (images.measurements - [0.0, face]) / spacing
+    made = jaxcal.make_images(
+        images.poses, pixels, kind="pixel", spacing_mm=spacing, face_offset_mm=face
+    )
+    result = jaxcal.calibrate(jaxcal.Recording(made), "conventional").numpy()
+    blocks = (*result.blocks, name)
+    values = [
+        np.array(stepped(name, TABLE[name].nominal, 0.02 + 0.01 * k, np.exp))
+        for k in range(TABLE[name].size)
+    ]
+    moved = replace(
+        result,
+        blocks=blocks,
+        linearisation=replace(result.linearisation, further=np.array(values)),
+        scale_mm_per_px=spacing * values if name == "scale" else spacing,
+        unknowns_covariance=np.full((count_unknowns(blocks),) * 2, np.nan),
+    )
+
+    def seen(values):
+        return measured(*(pixels * spacing).T, face, values)
+
+    x, (lateral, distance) = np.asarray(moved.image_to_probe), seen({name: values})
+    plane = np.stack([lateral, np.zeros_like(lateral), distance], axis=1)
+    expected = plane @ x[:3, :3].T + x[:3, 3]
+    np.testing.assert_allclose(moved.apply(pixels).points, expected, atol=1e-9)
+    jacobian = image_jacobian(moved, plane[:, [0, 2]])
+    for column, (sideways, deep) in further_derivatives(seen, {name: values}, blocks):
+        expected = np.stack([sideways, np.zeros_like(deep), deep], axis=1)
+        np.testing.assert_allclose(jacobian[..., column], expected, atol=1e-9)
 
 
 @pytest.mark.parametrize("shift_mm", [0.0, 6.0])

@@ -30,7 +30,7 @@ from jaxcal.data.problem import Channels
 from jaxcal.data.recording import make_images
 from jaxcal.diagnostics.influence import influence_of, whitened_errors
 from jaxcal.report.accuracy import GOOD_MM
-from jaxcal.report.record import calibration_record
+from jaxcal.report.record import calibration_record, further_unknowns
 
 
 @pytest.fixture(scope="module")
@@ -305,6 +305,12 @@ def test_the_sound_speed_is_as_uncertain_as_its_covariance_says(correlated):
     speed, sd = correlated[0].sound_speed_m_s, correlated[0].sound_speed_sd_m_s
     whole = np.asarray(correlated[0].unknowns_covariance)
     assert float(sd) == pytest.approx(float(speed) * whole[9, 9] ** 0.5, rel=1e-9)
+    told = further_unknowns(correlated[0].numpy())["sound-speed"]
+    nominal = float(np.asarray(correlated[0].problem.nominal_sound_speed))
+    assert told["tangents"] == ("log_sound_speed",)
+    assert told["values"] * nominal == pytest.approx([float(speed)], rel=1e-9)
+    assert told["sd"] * speed == pytest.approx([float(sd)], rel=1e-9)
+    assert told["prior_sd"] is None
 
 
 def test_alike_errors_count_the_same_whether_they_are_the_trackers_or_not(correlated):

@@ -316,6 +316,11 @@ def test_tables(record, failed, recording):
     text = text_of(calibration_table(record))
     assert f"{record['image_plane_to_probe'][0][3]:.6f}" in text
     assert "19 used of 20" in text
+    assert record["further_unknowns"] == {}
+    # Whatever further unknown the table may have one day.
+    found = {"tangents": ["bend_rad"], "values": [-0.0123], "sd": [0.004], "prior_sd": 0.03}
+    text = text_of(calibration_table({**record, "further_unknowns": {"bend": found}}))
+    assert "bend_rad -0.0123 +- 0.004" in text
     lost = calibration_record(failed, recording)
     assert "failed" in text_of(calibration_table(lost))
     text = text_of(comparison_table({"joint": record, "lost": lost}, {"joint": 1.25}))

@@ -18,6 +18,8 @@ pivots of A - c 1 show whether the smallest eigenvalue of a matrix A exceeds a n
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -30,7 +32,15 @@ from jaxcal.model.batch import ImagePlanes, Iterate, barrier, targets
 from jaxcal.model.distributions import OffsetLaw
 from jaxcal.model.parameters import Parameters
 from jaxcal.model.thresholds import LARGEST_ELEVATION, MINIMUM_SELF_TUNING
-from jaxcal.model.unknowns import FURTHER, TABLE, Blocks, block_slice, count_unknowns, measured
+from jaxcal.model.unknowns import (
+    FURTHER,
+    TABLE,
+    Blocks,
+    block_slice,
+    count_unknowns,
+    measured,
+    with_prior,
+)
 from jaxcal.result.calibration import Calibration, Linearisation, Medium, Status
 from jaxcal.solvers.convergence import Convergence
 from jaxcal.solvers.dense import inverse_batch_last
@@ -52,20 +62,23 @@ class Solved(eqx.Module):
             functions of the data, and so are the following.
         offset: offset unknowns, mm, or in the tracker's SDs for tracker noise; k = 0 where they
             were eliminated.
-        sigma: SDs that whiten the residuals, mm; None for residuals in mm.
+        sigma: SDs by which residuals are divided, of the kinds in :attr:`Observation.error_sd`, mm;
+            None for residuals in mm.
         bound: on the offsets, mm; None where there is none.
         information: of the shared unknowns, offsets eliminated.
         design: of the unweighted residuals, offsets known.
         convergence: how the method ended.
+        prior_sd: prior SDs of further unknowns, as in :class:`Linearisation`.
     """
 
     parameters: Parameters
     offset: Float[Array, "*batch k"]
-    sigma: Float[Array, "*batch components"] | None
+    sigma: Float[Array, "*batch 3"] | None
     bound: Float[Array, "*batch n"] | None
     information: Float[Array, "*batch p p"]
     design: Float[Array, "*batch p p"]
     convergence: Convergence
+    prior_sd: Float[Array, "*batch priors"] | None
 
 
 class Average(eqx.Module):
@@ -106,8 +119,14 @@ def assemble(
     # matrices stay outside it: it would move their batch axis to the front, and back again.
     parts = (solved.parameters, solved.offset, solved.sigma, solved.bound, solved.convergence)
     parameters, offset, sigma, bound, convergence = barrier(parts)
-    information, design = solved.information, solved.design
-    solved = Solved(parameters, offset, sigma, bound, information, design, convergence)
+    solved = replace(
+        solved,
+        parameters=parameters,
+        offset=offset,
+        sigma=sigma,
+        bound=bound,
+        convergence=convergence,
+    )
     blocks, mask = plan.blocks, problem.mask
     used = jnp.sum(mask, axis=-1)
     errors = Errors.of(parameters, images, blocks)
@@ -166,6 +185,7 @@ def assemble(
             tracker_sd=tracker_sd,
             average_elevation_sd=None if averaged is None else averaged.elevation_sd,
             further=_further(parameters, blocks),
+            prior_sd=solved.prior_sd,
         ),
         problem=None,
         method=plan.method,
@@ -345,13 +365,9 @@ def _status(
 ) -> Int[Array, "*batch"]:
     parameters, convergence = solved.parameters, solved.convergence
     finite = jnp.isfinite(convergence.cost)
-    for leaf, axes in (
-        (parameters.rotation, (-2, -1)),
-        (parameters.translation, -1),
-        (parameters.point, -1),
-        (parameters.scale, -1),
-    ):
-        finite = finite & jnp.all(jnp.isfinite(leaf), axis=axes)
+    for leaf in jax.tree.leaves(parameters):
+        own = tuple(range(finite.ndim, leaf.ndim))
+        finite = finite & jnp.all(jnp.isfinite(leaf), axis=own)
     failed = jnp.logical_not(finite) | (used < MINIMUM_IMAGES)
     status = jnp.where(convergence.tolerance_met, Status.CONVERGED, Status.MAX_ITERATIONS)
     status = jnp.where(observed.degenerate | observed.weak, Status.UNOBSERVABLE, status)
@@ -405,8 +421,8 @@ def _three_sigmas(
     if solved.sigma is not None and not plan.channels:
         return solved.sigma
     if solved.sigma is not None:
-        point_sd = solved.sigma[..., :1] * _point_sd(errors, problem)
-        return jnp.concatenate([point_sd, solved.sigma[..., 1:]], axis=-1)
+        point_sd = solved.sigma[..., :2] * _point_sd(errors, problem)
+        return jnp.concatenate([point_sd, solved.sigma[..., 2:]], axis=-1)
     used = jnp.sum(problem.mask, axis=-1)
     # The unknowns' degrees of freedom are shared equally by the three components.
     freedom = jnp.maximum(used - count_unknowns(plan.blocks) / 3, 1.0)
@@ -450,21 +466,20 @@ def _medium(
     """Sound speed and delay in their units, with SDs; None where neither was estimated."""
     blocks, speed = plan.blocks, problem.nominal_sound_speed
     found: dict[str, Array | None] = {}
-
-    def prior_sd(which: int) -> Array | None:
-        sd = given.medium_sd
-        return None if sd is None else jnp.broadcast_to(sd[which], speed.shape)
-
+    prior: dict[str, Array] = {}
+    if given.prior_sd is not None:
+        each = jnp.broadcast_to(given.prior_sd, (*speed.shape, *given.prior_sd.shape))
+        prior = dict(zip(with_prior(blocks), jnp.moveaxis(each, -1, 0), strict=True))
     if "sound-speed" in blocks:
         at = block_slice(blocks, "sound-speed").start
         estimate = speed * parameters.sound_speed
         found["sound_speed_m_s"] = estimate
         found["sound_speed_sd_m_s"] = estimate * jnp.sqrt(covariance[..., at, at])
-        found["sound_speed_prior_m_s"] = prior_sd(0)
+        found["sound_speed_prior_m_s"] = prior.get("sound-speed")
     if "delay" in blocks:
         at = block_slice(blocks, "delay").start
         before = 0.0 if problem.delay is None else problem.delay
         found["delay_s"] = before + parameters.delay / (1e3 * speed)
         found["delay_sd_s"] = jnp.sqrt(covariance[..., at, at]) / (1e3 * speed)
-        found["delay_prior_s"] = prior_sd(1)
+        found["delay_prior_s"] = prior.get("delay")
     return Medium(**found) if found else None

@@ -24,7 +24,15 @@ from jaxcal.calibration.serial_correlation import widened
 from jaxcal.data.problem import Problem, as_batch, as_problem, check_shapes, check_values
 from jaxcal.data.recording import MINIMUM_IMAGES, Recording
 from jaxcal.model.distributions import Shape
-from jaxcal.model.unknowns import FURTHER, MEDIUM, RIGID
+from jaxcal.model.unknowns import (
+    DELAY_SD_S,
+    FURTHER,
+    MEDIUM,
+    RIGID,
+    SOUND_SPEED_SD_M_S,
+    TABLE,
+    with_prior,
+)
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import AnyArray, Array
 from jaxcal.runtime.arrays import array_module, is_traced
@@ -55,12 +63,6 @@ PRIORS: dict[str, tuple[PriorName, ...]] = {
     "conventional": (),
 }
 """The priors that go with each method, beside ``auto``."""
-
-SOUND_SPEED_SD_M_S = 20.0
-"""Prior SD of the sound speed about its nominal value, m/s: some seven kelvin of water."""
-
-DELAY_SD_S = 1e-6
-"""Prior SD of the electronic delay about its nominal value, s."""
 
 ALTERNATION = ("tolerance_rad", "tolerance_mm", "max_rounds", "inner_steps")
 """The options that the alternation alone has."""
@@ -369,11 +371,12 @@ def prepare(
         return None if value is None else array_module(value).asarray(value, dtype)
 
     blocks = RIGID + tuple(name for name in FURTHER if name in request.estimate)
-    medium = None
-    if kind == "gaussian" and any(name in blocks for name in MEDIUM):
-        believed = (request.sound_speed_sd, request.delay_sd)
-        medium = array_module(believed).stack([array(sd) for sd in believed])
-    given = Given(array(request.sigma), array(request.tracker_sd), medium)
+    prior_sd = None
+    if kind == "gaussian" and with_prior(blocks):
+        asked = {"sound-speed": request.sound_speed_sd, "delay": request.delay_sd}
+        believed = [array(asked.get(name, TABLE[name].prior_sd)) for name in with_prior(blocks)]
+        prior_sd = array_module(believed).stack(believed)
+    given = Given(array(request.sigma), array(request.tracker_sd), prior_sd)
     components = 2 if channels else 3
     if given.sigma is not None and given.sigma.shape != (components,):
         names = "element distance, offset" if channels else "lateral, range, elevational"

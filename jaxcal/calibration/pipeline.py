@@ -16,13 +16,7 @@ from jaxtyping import Array, Float
 from jaxcal.calibration.answer import Average, Solved, assemble
 from jaxcal.data.problem import Problem
 from jaxcal.model.batch import ImagePlanes, barrier
-from jaxcal.model.observations import (
-    BoundedOffsets,
-    InPlane,
-    LocalUnknown,
-    Points,
-    local_unknowns,
-)
+from jaxcal.model.observations import BoundedOffsets, LocalUnknown, local_unknowns
 from jaxcal.model.unknowns import Blocks
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.jax_modes import in_standard_promotion
@@ -109,11 +103,12 @@ def _solved(
     solved = Solved(
         parameters=found.iterate.parameters(),
         offset=offset,
-        sigma=observation.sigma.T if observation.whitened else None,
+        sigma=observation.sigma.T[:, [*observation.error_sd]] if observation.whitened else None,
         bound=observation.bound if isinstance(observation, BoundedOffsets) else None,
         information=jnp.moveaxis(information, -1, 0),
         design=jnp.moveaxis(design, -1, 0),
         convergence=found.convergence,
+        prior_sd=None if found.medium is None else found.medium.sd.T,
     )
     if found.covariance is None or found.elevation_sd is None or found.law is None:
         return solved, None
@@ -126,10 +121,7 @@ def _normal_matrices(
 ) -> tuple[Float[Array, "p p batch"], Float[Array, "p p batch"]]:
     """The weighted normal matrix at a solution, and that of the unweighted components."""
     observation, iterate = found.observation, found.iterate
-    geometry = observation.geometry(images)
-    if isinstance(observation, Points) and "delay" in iterate.blocks:
-        # Of points a delay only shifts X; what offsets tell it apart by is far below their errors.
-        geometry = InPlane.of(images)
+    geometry = observation.geometry(images, iterate.blocks)
     if geometry is observation and observation.whitened:
         return information_and_design(iterate, observation, images, found.medium)
     weighted = accumulate(iterate, observation, images, None, found.medium).stacked()

@@ -35,7 +35,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxcal.diagnostics.image_errors import medium_prior
+from jaxcal.diagnostics.image_errors import further_prior
 from jaxcal.diagnostics.influence import whitened_errors
 from jaxcal.model.unknowns import block_slice
 from jaxcal.runtime.array_types import Float
@@ -87,7 +87,7 @@ def widened(result: Calibration) -> Calibration:
         return result
     answer = map_arrays(lambda leaf: np.asarray(leaf)[None], result)
     whitened = whitened_errors(answer)
-    before, after = _covariances(whitened.errors, whitened.rows, medium_prior(answer)[0])
+    before, after = _covariances(whitened.errors, whitened.rows, further_prior(answer)[0])
     linearisation = result.linearisation
     # The information about all unknowns changes in the same proportion.
     variance = float(linearisation.variance)

@@ -27,6 +27,7 @@ from jaxcal.model.unknowns import (
     further_derivatives,
     split_further,
     step_between,
+    with_prior,
 )
 from jaxcal.runtime.array_types import AnyArray, Float
 from jaxcal.runtime.arrays import array_module
@@ -275,27 +276,25 @@ def error_sd(answer: Calibration) -> Float[AnyArray, "*batch 3"]:
     return array_module(answer.sigma).hypot(answer.sigma, tracker[..., None])
 
 
-def medium_prior(answer: Calibration) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
-    """Precisions of the priors on sound speed and delay, and how far the answer is from nominal.
+def further_prior(answer: Calibration) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
+    """Precisions of the priors on further unknowns, and how far the answer is from nominal.
 
-    Both are in the order of one calibration's unknowns, in log units and mm; 0 for the others.
+    Both are in the order of one calibration's unknowns, in the units of their steps; 0 for those
+    without a prior.
 
     Args:
-        answer: one calibration, which holds its problem, with one leading axis.
+        answer: one calibration, with one leading axis.
     """
     precision, away = np.zeros((2, count_unknowns(answer.blocks)))
-    if answer.problem is None or answer.medium is None:
+    prior_sd = answer.linearisation.prior_sd
+    if prior_sd is None:
         return precision, away
-    speed = float(np.asarray(answer.problem.nominal_sound_speed)[0])
     further = Unknowns.of(answer).further
-    for name, prior, unit in (
-        ("sound-speed", answer.sound_speed_prior_m_s, speed),
-        ("delay", answer.delay_prior_s, 1 / (1e3 * speed)),
-    ):
-        if prior is not None:
-            at, row = block_slice(answer.blocks, name).start, model.TABLE[name]
-            precision[at] = (unit / float(np.asarray(prior)[0])) ** 2
-            away[at] = step_between(name, row.nominal, further[name][0][0], np.log)
+    for name, sd in zip(with_prior(answer.blocks), np.asarray(prior_sd)[0], strict=True):
+        nominal = model.TABLE[name].nominal
+        at = block_slice(answer.blocks, name)
+        precision[at] = sd**-2.0
+        away[at] = [step_between(name, nominal, value[0], np.log) for value in further[name]]
     return precision, away
 
 

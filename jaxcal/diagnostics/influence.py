@@ -36,7 +36,7 @@ from jaxcal.diagnostics.image_errors import (
     ImageErrors,
     Unknowns,
     Whitened,
-    medium_prior,
+    further_prior,
     own_covariance,
     quadratic,
 )
@@ -123,7 +123,7 @@ def influence_of(calibration: Calibration) -> Influence:
         found = whitened_errors(alone)
         averaged = calibration.offset_law is not None and bool(calibration.offset_law.weighed)
         at_minimum = not averaged and calibration.method != "alternating"
-        precision, away = medium_prior(alone)
+        precision, away = further_prior(alone)
         return _influence(found, precision, away, at_minimum=at_minimum)
 
 

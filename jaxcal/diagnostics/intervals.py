@@ -32,9 +32,15 @@ import numpy as np
 from scipy import special
 
 from jaxcal import InputError
-from jaxcal.data.sound import WATER_M_S
 from jaxcal.model.image_points import mean_of_squares, point_jacobian
-from jaxcal.model.unknowns import count_unknowns, in_image
+from jaxcal.model.unknowns import (
+    TINY,
+    Values,
+    count_unknowns,
+    in_image,
+    measured,
+    split_further,
+)
 from jaxcal.runtime.array_types import AnyArray, Float
 from jaxcal.runtime.arrays import array_module, is_traced
 from jaxcal.runtime.given_values import is_number, real_array
@@ -165,24 +171,22 @@ def range_of_row_zero(
 ) -> tuple[Float[AnyArray, "*batch"], Float[AnyArray, "*batch"]]:
     """The range of a measurement of 0, mm, and the factor on the nominal sound speed.
 
-    A calibration without its problem is assumed to have no face offset and the nominal sound speed
-    of water.
+    A calibration without its problem is assumed to have no face offset.
     """
     _check(calibration)
     xp = array_module(calibration)
-    problem = calibration.problem
-    face, before, nominal = 0.0, 0.0, WATER_M_S
-    if problem is not None:
-        face = problem.face_offset
-        nominal = problem.nominal_sound_speed
-        before = 0.0 if problem.delay is None else problem.delay
+    face = 0.0 if calibration.problem is None else calibration.problem.face_offset
     one = xp.ones(np.shape(calibration.mask)[:-1])
-    speed, delay = one, 0.0
-    if calibration.sound_speed_m_s is not None:
-        speed = xp.asarray(calibration.sound_speed_m_s) / xp.asarray(nominal)
-    if calibration.delay_s is not None:
-        delay = (xp.asarray(calibration.delay_s) - before) * 1e3 * xp.asarray(nominal)
-    return xp.asarray(one * speed * (xp.asarray(face) - delay)), xp.asarray(one * speed)
+    # A complex step, since a difference of ranges would have their rounding error.
+    at = measured(0.0, one * (1j * TINY), xp.asarray(face), beside_scale(calibration))[1]
+    return xp.asarray(xp.real(at)), xp.asarray(xp.imag(at) / TINY)
+
+
+def beside_scale(calibration: Calibration) -> Values:
+    """The estimated further unknowns but for the scale, which is in ``scale_mm_per_px``."""
+    further = calibration.linearisation.further
+    found = {} if further is None else split_further(further, calibration.blocks)
+    return {name: value for name, value in found.items() if name != "scale"}
 
 
 @traceable

@@ -13,14 +13,12 @@ needs the covariance of all these unknowns, not of X alone.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from jaxcal.model.unknowns import TABLE, Blocks
 from jaxcal.runtime.array_types import AnyArray, Float
-
-if TYPE_CHECKING:
-    from jaxcal.model.unknowns import Blocks
 
 
 def point_jacobian(
@@ -34,7 +32,7 @@ def point_jacobian(
 
     Args:
         points: [lateral, axial], mm.
-        blocks: the unknowns, in order; the target's columns are zero.
+        blocks: the unknowns, in order; the columns of those that move no image point are zero.
         origin: o, range of pixel row 0, mm.
         speed: k, factor on the sound speed.
         xp: numpy or jax.numpy.
@@ -47,13 +45,15 @@ def point_jacobian(
     columns = {
         "translation": [(one, zero, zero), (zero, one, zero), (zero, zero, one)],
         "rotation": [(zero, -z, zero), (z, zero, -x), (zero, x, zero)],
-        "point": [(zero, zero, zero)] * 3,
         "scale": [(x, zero, zero), (zero, zero, z - origin)],
         "sound-speed": [(zero, zero, z)],
         "delay": [(zero, zero, -speed)],
     }
-    chosen = [xp.stack(column, axis=-1) for block in blocks for column in columns[block]]
-    return xp.stack(chosen, axis=-1)
+    chosen = []
+    for block in blocks:
+        still = [(zero, zero, zero)] * TABLE[block].size
+        chosen += columns[block] if TABLE[block].in_image else still
+    return xp.stack([xp.stack(column, axis=-1) for column in chosen], axis=-1)
 
 
 def mean_of_squares(jacobian: Float[AnyArray, "*batch m 3 p"]) -> Float[np.ndarray, "*batch p p"]:

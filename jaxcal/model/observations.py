@@ -7,10 +7,12 @@ paper's Eq. 5):
     p(y) = (x, y, sqrt(r^2 - y^2)).
 
 An *observation* turns q, and further unknowns such as the pixels' scale, into residual planes, in
-groups (*components*) that share one SD. Residuals are defined nowhere else in the package: their
-derivatives follow from these functions (:mod:`jaxcal.model.derivatives`),
+groups (*components*) that share one SD. The solvers know residuals from here only: derivatives
+follow from these functions (:mod:`jaxcal.model.derivatives`),
 :mod:`jaxcal.solvers.normal_equations` sums over the images, and every method is a loop on those
 sums. A new observation needs one class here and one line in :mod:`jaxcal.solvers.methods`.
+Diagnostics, which need no JAX, have the errors of points in numpy as well
+(:mod:`jaxcal.diagnostics.image_errors`).
 
 - :class:`Points`: errors of lateral position and range, and the offset itself (y_i = q_y), each
   with its SD; :class:`OwnCovariances`: the same with a covariance for every image.
@@ -39,7 +41,6 @@ from jaxcal.model.batch import ImagePlanes, Iterate, pad_images, targets
 from jaxcal.model.thresholds import LARGEST_ELEVATION
 from jaxcal.model.unknowns import (
     FURTHER,
-    MEDIUM,
     RIGID_UNKNOWNS,
     TABLE,
     Blocks,
@@ -48,6 +49,7 @@ from jaxcal.model.unknowns import (
     predicted_distance,
     step_between,
     stepped,
+    with_prior,
 )
 from jaxcal.model.unrolled import Matrix, Vector, add
 from jaxcal.runtime.arrays import is_traced
@@ -129,6 +131,8 @@ class Observation(eqx.Module):
     """Whether residuals are divided by their SDs; else their variance is estimated from them."""
     oriented: ClassVar[bool] = False
     """Whether residuals depend on the image's orientation other than through q."""
+    error_sd: ClassVar[tuple[int, int, int]] = (0, 1, 2)
+    """Where in ``sigma`` the SDs of lateral position, range and offset are, if whitened."""
 
     def __check_init__(self) -> None:
         _check_values("sigma", self.sigma)
@@ -161,9 +165,14 @@ class Observation(eqx.Module):
         """Largest change of a whitened residual for a mm of error, 1/mm."""
         return 1 / jnp.min(self.sigma, axis=0)
 
-    def geometry(self, images: ImagePlanes) -> Observation:
-        """The observation whose unweighted residuals show which unknowns the poses determine."""
-        del images
+    def geometry(self, images: ImagePlanes, blocks: Blocks) -> Observation:
+        """The observation whose unweighted residuals show which unknowns the poses determine.
+
+        Args:
+            images: the data.
+            blocks: the free unknowns.
+        """
+        del images, blocks
         return self
 
     def padded(self) -> Observation:
@@ -215,6 +224,10 @@ class Points(Observation):
     ) -> list[Component]:
         lateral, distance = errors(q, further, images)
         return [Component([lateral]), Component([distance]), Component([q[1]])]
+
+    def geometry(self, images: ImagePlanes, blocks: Blocks) -> Observation:
+        # Of points a delay only shifts X; what offsets tell it apart by is far below their errors.
+        return InPlane.of(images) if "delay" in blocks else self
 
 
 def errors(q: Vector, further: FurtherUnknowns, images: ImagePlanes) -> tuple[Array, Array]:
@@ -292,7 +305,7 @@ class OwnCovariances(Observation):
     def with_sigma(self, sigma: Float[Array, "components batch"]) -> Observation:
         return super().with_sigma(sigma).in_units(sigma)
 
-    def geometry(self, images: ImagePlanes) -> Observation:
+    def geometry(self, images: ImagePlanes, blocks: Blocks) -> Observation:
         return InPlane.of(images)
 
     def padded(self) -> OwnCovariances:
@@ -334,6 +347,8 @@ class ChannelDistances(Observation):
     """
 
     sigma: Float[Array, "2 batch"]
+    # Lateral position and range both come from the elements' distances.
+    error_sd: ClassVar[tuple[int, int, int]] = (0, 0, 1)
 
     def components(
         self, q: Vector, further: FurtherUnknowns, images: ImagePlanes
@@ -435,7 +450,7 @@ class LocalUnknown(Observation):
     ) -> list[Component]:
         return self.components_at(q, self.local(q, further, images)[0], further, images)
 
-    def geometry(self, images: ImagePlanes) -> Observation:
+    def geometry(self, images: ImagePlanes, blocks: Blocks) -> Observation:
         return InPlane.of(images)
 
 
@@ -579,14 +594,14 @@ class TrackedPoints(LocalUnknown):
 
 
 class MediumPrior(eqx.Module):
-    """The prior of sound speed and delay: Gaussian, about their nominal values.
+    """The prior of those further unknowns that have one: Gaussian, about their nominal values.
 
     Attributes:
-        sd: prior SDs of the sound speed (relative) and of the delay (mm).
+        sd: prior SDs of the steps of :func:`jaxcal.model.unknowns.with_prior`.
         blocks: the free unknowns (static).
     """
 
-    sd: Float[Array, "2 batch"]
+    sd: Float[Array, "k batch"]
     blocks: Blocks = eqx.field(static=True)
 
     def repeated(self, times: int) -> MediumPrior:
@@ -594,11 +609,12 @@ class MediumPrior(eqx.Module):
         return MediumPrior(jnp.tile(self.sd, (1, times)), self.blocks)
 
     def deviations(self, iterate: Iterate) -> list[tuple[int, Array, Array]]:
-        """Index, deviation from nominal and precision of sound speed and delay, where free."""
+        """Index, deviation from nominal and precision of every component that has a prior."""
         found = []
-        for name, sd in zip(MEDIUM, self.sd, strict=True):
-            value = iterate.further(name)
-            if value is not None:
-                away = step_between(name, TABLE[name].nominal, value[0], jnp.log)
-                found.append((block_slice(self.blocks, name).start, away, 1 / (sd * sd)))
+        for name, sd in zip(with_prior(self.blocks), self.sd, strict=True):
+            values = iterate.further(name)
+            assert values is not None
+            for index, value in enumerate(values, block_slice(self.blocks, name).start):
+                away = step_between(name, TABLE[name].nominal, value, jnp.log)
+                found.append((index, away, 1 / (sd * sd)))
         return found

@@ -2,9 +2,10 @@
 
 X and the target are those of Eq. 7. *Further* unknowns convert what was measured to mm:
 :func:`measured` and :func:`predicted_distance` define how, in arithmetic that numpy, JAX and
-complex numbers share. All other code that depends on an unknown (steps, derivatives, names, words)
-reads this table. A new unknown needs a row, a line in :func:`measured`, and a field in
-:class:`jaxcal.model.parameters.Parameters`.
+complex numbers share. All other code that depends on an unknown (steps, priors, derivatives, names,
+words) reads this table. A new unknown needs a row, a line in :func:`measured`, a field in
+:class:`jaxcal.model.parameters.Parameters`, and, where it moves image points, a column in
+:mod:`jaxcal.model.image_points`.
 """
 
 from __future__ import annotations
@@ -38,6 +39,9 @@ class Unknown:
         words: one component in words, with a place for the axis.
         axes: the words for that place.
         oblique: several components in words; empty for a single one.
+        prior_sd: SD of its Gaussian prior about the nominal value, in the unit in which a caller
+            gives it, where the caller gives none; None: it has no prior.
+        per_unit: from the nominal sound speed (m/s) to the step that is one such unit.
     """
 
     name: str
@@ -48,6 +52,8 @@ class Unknown:
     words: str
     axes: tuple[str, ...] = ("",)
     oblique: str = ""
+    prior_sd: float | None = None
+    per_unit: Callable[[Any], Any] = lambda speed: 1.0
 
     @property
     def size(self) -> int:
@@ -64,6 +70,12 @@ class Unknown:
         """Its value where it is not free."""
         return 1.0 if self.step == "factor" else 0.0
 
+
+SOUND_SPEED_SD_M_S = 20.0
+"""Prior SD of the sound speed about its nominal value, m/s: some seven kelvin of water."""
+
+DELAY_SD_S = 1e-6
+"""Prior SD of the electronic delay about its nominal value, s."""
 
 _IMAGE_AXES = ("lateral", "elevational", "axial")
 
@@ -119,8 +131,19 @@ TABLE = {
             lever=True,
             in_image=True,
             words="sound speed{}",
+            prior_sd=SOUND_SPEED_SD_M_S,
+            per_unit=lambda speed: 1 / speed,
         ),
-        Unknown("delay", ("delay_mm",), "add", lever=False, in_image=True, words="delay{}"),
+        Unknown(
+            "delay",
+            ("delay_mm",),
+            "add",
+            lever=False,
+            in_image=True,
+            words="delay{}",
+            prior_sd=DELAY_SD_S,
+            per_unit=lambda speed: 1e3 * speed,
+        ),
     )
 }
 """The rows are in the order of a step's components."""
@@ -138,7 +161,7 @@ TINY = 1e-20
 """A complex step: its square is negligible in double precision."""
 
 MEDIUM = ("sound-speed", "delay")
-"""The unknowns between a time of flight and a distance; both have a prior."""
+"""The unknowns between a time of flight and a distance."""
 
 
 def measured(lateral: Any, axial: Any, face: Any, values: Values) -> tuple[Any, Any]:
@@ -245,6 +268,11 @@ def block_slice(blocks: Blocks, name: str) -> slice:
             return slice(start, start + TABLE[block].size)
         start += TABLE[block].size
     raise KeyError(name)
+
+
+def with_prior(blocks: Blocks) -> Blocks:
+    """Those of the blocks that have a prior, in the table's order."""
+    return tuple(name for name in FURTHER if name in blocks and TABLE[name].prior_sd is not None)
 
 
 def split_further(values: Any, blocks: Blocks) -> dict[str, list[Any]]:

@@ -11,12 +11,20 @@ import jaxcal
 from jaxcal import InputError
 from jaxcal.data.poses import rotation_angle
 from jaxcal.data.recording import Images, Recording, Truth
-from jaxcal.diagnostics.intervals import range_of_row_zero
+from jaxcal.diagnostics.intervals import beside_scale
 from jaxcal.diagnostics.law_words import offset_law
 from jaxcal.diagnostics.metrics import reconstruction_precision
 from jaxcal.diagnostics.misfits import noise_model
 from jaxcal.diagnostics.outliers import outlier_reasons, outliers, suspects
-from jaxcal.model.unknowns import in_image, tangent_names
+from jaxcal.model.unknowns import (
+    TABLE,
+    block_slice,
+    in_image,
+    measured,
+    split_further,
+    tangent_names,
+    with_prior,
+)
 from jaxcal.report.accuracy import accuracy_record, as_solved, settle
 from jaxcal.report.certified import certificate_record
 from jaxcal.result.calibration import Calibration
@@ -38,6 +46,9 @@ CONVENTION = {
     "mm, then omega in rad, along and about the image's axes",
     "image_covariance": "of image_unknowns: those of covariance, and the logarithms of estimated "
     "pixel sizes and sound speed, and the delay in mm",
+    "further_unknowns": "every unknown that was estimated beside X and the target: values "
+    "(factors on the nominal ones where a tangent is log_..., else in the tangent's unit), SDs and "
+    "prior SDs of the tangents; prior_sd is null without a prior",
     "face_offset_mm": "range of pixel row 0, or of a measured range of 0; range_factor: estimated "
     "sound speed over the nominal one",
     "tre": "target registration error: distance between the true and the calibrated place of an "
@@ -124,6 +135,7 @@ def calibration_record(
         "scale_mm_per_px": answer.scale_mm_per_px,
         "face_offset_mm": transform.face_offset_mm,
         "range_factor": transform.range_factor,
+        "further_unknowns": further_unknowns(answer),
         "data": result.data,
         "channel_sigma_mm": answer.channel_sigma,
         "sound_speed_m_s": answer.sound_speed_m_s,
@@ -148,6 +160,29 @@ def calibration_record(
     found = plain(record)
     settle(found)
     return found
+
+
+def further_unknowns(answer: Calibration) -> dict[str, dict[str, Any]]:
+    """Values, SDs and prior SDs of the unknowns that were estimated beside X and the target.
+
+    Args:
+        answer: one calibration in numpy arrays.
+    """
+    found, blocks = answer.linearisation, answer.blocks
+    further = {} if found.further is None else split_further(found.further, blocks)
+    sd = np.sqrt(np.diagonal(answer.unknowns_covariance))
+    prior: dict[str, Any] = {}
+    if found.prior_sd is not None:
+        prior = dict(zip(with_prior(blocks), found.prior_sd, strict=True))
+    return {
+        name: {
+            "tangents": TABLE[name].tangents,
+            "values": np.array(values),
+            "sd": sd[block_slice(blocks, name)],
+            "prior_sd": prior.get(name),
+        }
+        for name, values in further.items()
+    }
 
 
 def truth_error(result: Calibration, truth: Truth) -> dict[str, float]:
@@ -233,8 +268,6 @@ def _points_mm(images: Images, result: Calibration) -> Float[np.ndarray, "n 2"]:
         scale = result.scale_mm_per_px
         if images.spacing_mm is not None and "scale" not in result.blocks:
             scale = images.spacing_mm
-    points = images.measurements * np.asarray(scale) + [0.0, images.face_offset_mm]
-    # Of the calibration's images, whose face offset may be another one.
-    origin, factor = map(float, range_of_row_zero(result))
-    face = 0.0 if result.problem is None else float(np.asarray(result.problem.face_offset))
-    return points * [1.0, factor] + [0.0, origin - factor * face]
+    lateral, axial = (images.measurements * np.asarray(scale)).T
+    points = measured(lateral, axial, images.face_offset_mm, beside_scale(result))
+    return np.stack(points, axis=1)

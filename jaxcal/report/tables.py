@@ -12,6 +12,8 @@ from jaxcal.report.certified import certificate_words
 from jaxcal.report.verdict import spread_of_transform, title_of_transform
 
 _UNKNOWN = "-"
+_IN_OWN_UNITS = ("scale", "sound-speed", "delay")
+"""The further unknowns that have lines of their own."""
 
 
 def calibration_table(record: dict[str, Any]) -> RenderableType:
@@ -105,6 +107,15 @@ def _facts(record: dict[str, Any]) -> list[tuple[str, str]]:
                 f"{1e6 * record['delay_s']:.3f} +- " + ("-" if sd is None else f"{1e6 * sd:.3f}"),
             )
         )
+    for name, found in record["further_unknowns"].items():
+        if name not in _IN_OWN_UNITS:
+            words = [
+                f"{tangent} {_number(value, '.5g')} +- {_number(sd, '.2g')}"
+                for tangent, value, sd in zip(
+                    found["tangents"], found["values"], found["sd"], strict=True
+                )
+            ]
+            facts.append((name, ", ".join(words)))
     sight = record["observability"]
     # If the direction is not determined at all, the SD only shows where rounding begins.
     sd = sight["weakest_sd_mm"] if record["status"] != "unobservable" else None

@@ -70,6 +70,9 @@ class Linearisation:
         further: values of the free further unknowns in the order of ``Calibration.blocks``: factors
             on the nominal values, and mm (:func:`jaxcal.model.unknowns.measured`); None if there
             are none.
+        prior_sd: SDs of the Gaussian priors of those that have one
+            (:func:`jaxcal.model.unknowns.with_prior`), of their steps (relative, mm or rad); None
+            without a prior.
     """
 
     information: Float[AnyArray, "*batch p p"]
@@ -78,6 +81,7 @@ class Linearisation:
     tracker_sd: Float[AnyArray, "*batch"] | None
     average_elevation_sd: Float[AnyArray, "*batch n"] | None
     further: Float[AnyArray, "*batch k"] | None
+    prior_sd: Float[AnyArray, "*batch priors"] | None = None
 
 
 @array_tree

@@ -109,7 +109,7 @@ def average_over_laws(
         shapes: the laws to weigh.
         variances: the images' own: lateral variance, covariance, range variance, mm^2; or None.
         bound: on the offsets, mm, which cuts the laws; or None.
-        medium: prior of sound speed and delay, or None.
+        medium: prior of further unknowns, or None.
     """
     used, unknowns = images.used, iterate.unknowns
     common = tune(iterate, observation, images, medium)

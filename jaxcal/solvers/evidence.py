@@ -162,7 +162,7 @@ def tune(
         iterate: to start from.
         observation: with the SDs to start from, mm.
         images: the data.
-        medium: prior of sound speed and delay, or None.
+        medium: prior of further unknowns, or None.
         rounds: passes before the last one.
     """
     count, start = observation.count(images), observation.sigma

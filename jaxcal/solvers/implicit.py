@@ -41,7 +41,7 @@ def implicit_tangent(
         iterate: the solution (not differentiated).
         observation: the objective.
         images: the data.
-        medium: prior of sound speed and delay, or None.
+        medium: prior of further unknowns, or None.
 
     Returns:
         The step of the unknowns about the solution; zero in value.
@@ -82,7 +82,7 @@ def self_tuned_tangent(
         sigma: its SDs, mm (not differentiated).
         observation: the objective; its SDs are held where too few images determine them.
         images: the data.
-        medium: prior of sound speed and delay, or None.
+        medium: prior of further unknowns, or None.
 
     Returns:
         The step of the unknowns about the solution (zero in value), and the SDs.

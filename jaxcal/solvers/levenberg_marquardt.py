@@ -382,7 +382,7 @@ def minimise(
         start: unknowns to start from.
         observation: the objective.
         images: the data.
-        medium: prior of sound speed and delay, or None.
+        medium: prior of further unknowns, or None.
         damping: first lambda, relative to the diagonal; 0 for Gauss-Newton, which takes every step.
         tolerance: gradient cosine to stop at; by default 1e-10 in float64, 1e-4 in float32.
         max_steps: most passes.

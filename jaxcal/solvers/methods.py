@@ -29,7 +29,7 @@ from jaxcal.model.observations import (
     unit_shape,
     variance_planes,
 )
-from jaxcal.model.unknowns import MEDIUM
+from jaxcal.model.unknowns import TABLE, with_prior
 from jaxcal.solvers import implicit
 from jaxcal.solvers.alternating import Alternation, alternate, bounded
 from jaxcal.solvers.auto import average_over_laws
@@ -54,7 +54,7 @@ class Solution(eqx.Module):
     Attributes:
         iterate: X, c and the further unknowns.
         observation: the objective, with its SDs.
-        medium: prior of sound speed and delay, or None.
+        medium: prior of further unknowns, or None.
         convergence: how the method ended.
         covariance: of the unknowns over all laws of the offsets, where they were weighed.
         elevation_sd: SDs of the offsets over all laws, mm, where they were weighed.
@@ -128,11 +128,13 @@ def observe(
     sigma = jnp.asarray(fallback, dtype) if given.sigma is None else given.sigma
     sigma = jnp.broadcast_to(sigma[:, None], (len(fallback), images.batch_size))
     medium = None
-    if given.medium_sd is not None and any(name in plan.blocks for name in MEDIUM):
+    if given.prior_sd is not None:
         speed = problems.nominal_sound_speed
-        # A delay in s is a distance in mm at the nominal speed.
-        sd = jnp.stack([given.medium_sd[0] / speed, given.medium_sd[1] * speed * 1e3])
-        medium = MediumPrior(sd, plan.blocks)
+        steps = [
+            jnp.broadcast_to(sd * TABLE[name].per_unit(speed), speed.shape)
+            for name, sd in zip(with_prior(plan.blocks), given.prior_sd, strict=True)
+        ]
+        medium = MediumPrior(jnp.stack(steps), plan.blocks)
     if plan.channels:
         return ChannelDistances(sigma), medium
     shape = None
@@ -162,10 +164,8 @@ def run(
     if plan.self_tuning:
         assert isinstance(found, SelfTuned | Fit)
         observation = observation.with_sigma(found.updated)
-        floored, rounds = on_floor(found.updated).T, found.iterations
-        if plan.channels:
-            # Lateral position and range both come from the elements' distances.
-            floored = floored[:, [0, 0, 1]]
+        floored = on_floor(found.updated).T[:, [*observation.error_sd]]
+        rounds = found.iterations
     moves = (zero, zero)
     if isinstance(found, Alternation):
         moves = (found.rotation_change, found.translation_change)

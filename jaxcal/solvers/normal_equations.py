@@ -410,7 +410,7 @@ def accumulate(
         images: the data.
         exact: 1 for exact second derivatives, 0 for Gauss-Newton's curvature; None for the latter
             everywhere.
-        medium: prior of sound speed and delay, or None.
+        medium: prior of further unknowns, or None.
 
     Returns:
         The normal equations of the step of X, c and the further unknowns; an image's own unknown is
@@ -463,7 +463,7 @@ def information_and_design(
         iterate: X, c and the further unknowns of every problem.
         observation: one without an unknown in every image.
         images: the data.
-        medium: prior of sound speed and delay, or None.
+        medium: prior of further unknowns, or None.
     """
     q, tracker_to_image = targets(iterate, images)
     derived = _derive(observation, q, tracker_to_image, iterate, images, exact=False)
@@ -492,7 +492,7 @@ class ComponentSums(eqx.Module):
         gradient: g_k.
         matrix: N_k, Gauss-Newton's, upper triangles.
         rest: C, the exact curvature with the given SDs less sum N_k / s_k^2; zeros without SDs.
-        prior: what the prior of sound speed and delay adds to cost, gradient and diagonal of the
+        prior: what the prior of further unknowns adds to cost, gradient and diagonal of the
             curvature.
     """
 
@@ -530,7 +530,7 @@ def component_sums(
         observation: one without an unknown in every image.
         images: the data.
         sigma: SDs for the rest of the exact curvature, mm; None leaves it out.
-        medium: prior of sound speed and delay, or None.
+        medium: prior of further unknowns, or None.
     """
     q, tracker_to_image = targets(iterate, images)
     derived = _derive(observation, q, tracker_to_image, iterate, images, exact=sigma is not None)

@@ -145,12 +145,13 @@ class Given:
     Attributes:
         sigma: SDs of (lateral, range, offset), or of (element distance, offset) on channels, mm.
         tracker_sd: SD of the tracked position, mm.
-        medium_sd: prior SDs of the sound speed (m/s) and the delay (s).
+        prior_sd: prior SDs of the free unknowns that have one, in the units of the request
+            (:func:`jaxcal.model.unknowns.with_prior`); None without a prior.
     """
 
     sigma: Float[AnyArray, " components"] | None
     tracker_sd: Float[AnyArray, ""] | None
-    medium_sd: Float[AnyArray, 2] | None
+    prior_sd: Float[AnyArray, " k"] | None
 
 
 def is_one_of(value: object, names: Any) -> bool:

@@ -249,7 +249,7 @@ class Tuning(eqx.Module):
     Attributes:
         observation: the objective.
         images: the data.
-        medium: prior of sound speed and delay, or None.
+        medium: prior of further unknowns, or None.
         fallback: the SDs of problems with too few images to estimate them, mm.
         count: numbers of residuals.
         enough: problems with enough images to estimate SDs.
@@ -419,7 +419,7 @@ def self_tuned(
         start: a conventional fit.
         observation: the objective; problems with fewer than 8 used images keep its SDs.
         images: the data.
-        medium: prior of sound speed and delay, or None.
+        medium: prior of further unknowns, or None.
         max_rounds: most passes.
         trace: how many values of the objective to keep.
     """

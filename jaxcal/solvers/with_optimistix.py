@@ -108,7 +108,7 @@ def minimise_with(
         start: unknowns to start from.
         observation: the objective.
         images: the data, a batch of one.
-        medium: prior of sound speed and delay, or None.
+        medium: prior of further unknowns, or None.
         options: with the largest number of steps and the length of the trace.
     """
 
@@ -139,7 +139,7 @@ def self_tuned_with(
         start: the conventional fit.
         observation: the objective; its SDs are held where too few images determine them.
         images: the data, a batch of one.
-        medium: prior of sound speed and delay, or None.
+        medium: prior of further unknowns, or None.
         options: with the largest number of steps of each solve.
     """
     enough = images.used >= MINIMUM_SELF_TUNING
