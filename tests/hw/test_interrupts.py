@@ -70,15 +70,16 @@ def test_an_interrupt_right_before_an_endless_wait_ends_it(monkeypatch, where):
 
     # A signal that another thread takes does not end a read or a wait of the main thread.
     timers = [
-        threading.Timer(0.1, signal.raise_signal, [signal.SIGINT]),
+        threading.Timer(0.2, signal.raise_signal, [signal.SIGINT]),
         threading.Timer(5.0, give_up),
     ]
-    with open(terminal, encoding="utf-8") as stdin:
+    wait = {"code": typed_code, "pause": pause.wait}[where]
+    with open(terminal, encoding="utf-8") as stdin, as_interrupts():
         monkeypatch.setattr(sys, "stdin", stdin)
-        with as_interrupts(), pytest.raises(KeyboardInterrupt):
-            for timer in timers:
-                timer.start()
-            pause.wait() if where == "pause" else typed_code()
+        for timer in timers:
+            timer.start()
+        with pytest.raises(KeyboardInterrupt):
+            wait()
         timers[1].cancel()
     os.close(keyboard)
     assert not late.is_set()
