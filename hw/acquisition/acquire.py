@@ -40,6 +40,7 @@ from hw.midplane.pattern_injection import (
 from hw.midplane.search import PlacementError, first_seen
 from hw.midplane.threshold_climb import threshold_climb
 from hw.recording.recorder import Recorder
+from hw.recording.resuming import compare_electronics, described_electronics
 from hw.recording.session import Session, Watch, median_times
 from hw.robot.confirmation import Confirmation
 from hw.robot.gate import check_sample
@@ -278,6 +279,10 @@ class _Run:
         """The motion of the plan, once that was checked and confirmed; not started yet."""
         job, setup = self.job, self.job.setup
         plan = motion_plan(job, session)
+        if job.progress is not None:
+            now = described_electronics(session.echo)
+            for change in compare_electronics(job.progress.electronics, now):
+                self._note("changed", change)
         check_sample(session.poses.latest(), plan.limits, self.clock)
         course = check_plan(plan)
         reach = NOT_CHECKED if course is None else f"{plan.limits.arm_model}: {course.text}"

@@ -78,7 +78,7 @@ def test_an_image_that_a_slow_link_holds_up_is_not_of_the_next_pose(tmp_path):
         ImageServer(
             lambda t: np.full((40, 30), int(1000 * t) % 256, np.uint8), clock=robot.clock
         ) as machine,
-        Recorder(tmp_path / "r.h5", RecordingHeader("pixel", {}, 8, None, "{}")) as recorder,
+        Recorder(tmp_path / "r.h5", RecordingHeader("pixel", {}, 8, settings="{}")) as recorder,
     ):
         link = Link(machine)
         setup = Setup(
@@ -106,7 +106,7 @@ def test_images_of_a_machine_that_also_sends_rf(tmp_path):
             lambda t: np.full((40, 30), int(1000 * t) % 256, np.uint8),
             rf=lambda t: np.full((200, 8), int(1000 * t) % 1000, np.int16),
         ) as machine,
-        Recorder(path, RecordingHeader("pixel", {}, 8, None, "{}")) as recorder,
+        Recorder(path, RecordingHeader("pixel", {}, 8, settings="{}")) as recorder,
     ):
         setup = Setup(
             robot.host, emulator.path, scene, {}, (machine.host, machine.port),
