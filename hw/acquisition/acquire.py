@@ -392,10 +392,10 @@ class _Run:
 
         Raises:
             PlacementError: no frame shows a credible target.
-            DeviceError: a device is in lasting trouble.
+            DeviceError: a device is in lasting trouble, or the pose changed at rest.
         """
         setup = self.job.setup
-        steady = session.poses.steady(setup.settle_s)
+        pose = stage.resting_pose(setup.settle_s)
         if self.job.request.by_image:
             measurement, amplitude = stage.locate(row)
         else:
@@ -403,7 +403,7 @@ class _Run:
             measurement, amplitude = median_times(heard)
         stage.check()
         session.record_image()
-        return _Shot(steady.sample.pose, measurement, amplitude)
+        return _Shot(pose, measurement, amplitude)
 
     def _select(self, row: int, placement: Placement, shot: _Shot, began: float) -> None:
         """Put the image among those of the calibration, and solve again."""
