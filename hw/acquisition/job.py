@@ -101,6 +101,8 @@ def open_recorder(path: str | os.PathLike[str], job: Job) -> Recorder:
     )
     recorder = Recorder(path, header)
     recorder.put("plan", "targets", job.targets, "mm")
+    # A recording that is there can be resumed, whatever happens next.
+    recorder.sync()
     return recorder
 
 

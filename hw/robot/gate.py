@@ -167,7 +167,7 @@ class Gate:
         if (
             not isinstance(speed, int | float)
             or isinstance(speed, bool)
-            or not min(_LEAST_SPEED_MM_S, cap) <= speed <= cap
+            or not _LEAST_SPEED_MM_S <= speed <= cap
         ):
             raise refused(
                 f"a speed of {speed!r} mm/s is not within {_LEAST_SPEED_MM_S:g} and {cap:g} mm/s"

@@ -12,6 +12,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -52,7 +53,7 @@ from hw.runtime.keys import Pause
 from hw.setup.check import check
 from hw.setup.description import Setup
 from hw.setup.emulated import BenchOracle, setup_of, start
-from jaxcal import InputError
+from jaxcal import InputError, OutputError
 from jaxcal.cli.main import main
 
 IMAGES = 5
@@ -578,6 +579,16 @@ def test_a_resumed_plan_holds_the_poses_that_the_way_leads_through():
     ]:
         plan = plan_to_go(whole, missing, here)
         np.testing.assert_array_equal(plan.targets, whole.targets[rows])
+
+
+def test_a_recording_whose_writer_is_killed_at_once_is_resumed(e_series, tmp_path):
+    """It was refused as not made by an acquisition, and a new one as one to resume."""
+    path, setup = tmp_path / "rec.h5", setup_of(e_series)
+    job = prepare(setup, path, AcquisitionRequest(4, "none", 1, bench=3))
+    with suppress(OutputError), open_recorder(path, job) as recorder:
+        recorder._process.kill()
+        recorder._process.wait()
+    assert prepare(setup, path, None).missing == [0, 1, 2, 3]
 
 
 def test_a_resumed_run_compares_the_electronics(e_series, tmp_path):
