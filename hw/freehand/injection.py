@@ -129,10 +129,10 @@ def acquire_by_injection(
         person.say(f"images of {posed.device!r}; poses from {posed.pair[0]} to {posed.pair[1]}")
         echo = stack.enter_context(ActiveEcho(setup.active_echo_url, lines=probe.elements))
         stack.callback(_switch_off, echo)
-        unit = described_electronics(echo)
-        changes = compare_electronics(before, unit)
         echo.set_threshold(setup.search.low_threshold)
         echo.stream(True)
+        unit = described_electronics(echo)
+        changes = compare_electronics(before, unit)
         recorder = Recorder(path) if resume else _recorder(path, asked, setup, posed)
         try:
             with recorder:

@@ -134,7 +134,9 @@ def check_same_robot(before: object, serial: str, tcp_offset: Sequence[float]) -
 
 def described_electronics(echo: ActiveEcho) -> dict[str, float | str]:
     """What a recording keeps of its electronics, as attributes of /ae."""
-    return {"clock_hz": echo.clock_hz(), "identity": echo.identify()[:_LONGEST_IDENTITY]}
+    # A device may say anything, but HDF5 takes no text with zeros in it.
+    identity = ascii(echo.identify())[1:-1][:_LONGEST_IDENTITY]
+    return {"clock_hz": echo.clock_hz(), "identity": identity}
 
 
 def compare_electronics(kept: Mapping[str, object], now: Mapping[str, float | str]) -> list[str]:
