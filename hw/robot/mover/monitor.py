@@ -1,4 +1,4 @@
-"""What must stop the robot: its own state, the program's, the connection's, force, box, silence."""
+"""What must stop the robot: state of robot, program and connection; force, speed, box, silence."""
 
 from __future__ import annotations
 
