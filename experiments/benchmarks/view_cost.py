@@ -72,7 +72,7 @@ def measure(pages: int, seconds: float) -> list[object]:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         probe = {"kind": "linear", "elements": 128, "pitch_mm": 0.457, "sound_speed_m_s": 1490.0}
         recorder = Recorder(
-            folder / "rec.h5", RecordingHeader("time_of_flight", probe, 128, None, "{}")
+            folder / "rec.h5", RecordingHeader("time_of_flight", probe, 128, settings="{}")
         )
         stack.enter_context(recorder)
         view = stack.enter_context(LiveView(print, port=8300))

@@ -40,6 +40,7 @@ from hw.midplane.pattern_injection import (
 from hw.midplane.search import PlacementError, first_seen
 from hw.midplane.threshold_climb import threshold_climb
 from hw.recording.recorder import Recorder
+from hw.recording.resuming import compare_electronics, described_electronics
 from hw.recording.session import Session, Watch, median_times
 from hw.robot.confirmation import Confirmation
 from hw.robot.gate import check_sample
@@ -278,6 +279,10 @@ class _Run:
         """The motion of the plan, once that was checked and confirmed; not started yet."""
         job, setup = self.job, self.job.setup
         plan = motion_plan(job, session)
+        if job.progress is not None:
+            now = described_electronics(session.echo)
+            for change in compare_electronics(job.progress.electronics, now):
+                self._note("changed", change)
         check_sample(session.poses.latest(), plan.limits, self.clock)
         course = check_plan(plan)
         reach = NOT_CHECKED if course is None else f"{plan.limits.arm_model}: {course.text}"
@@ -387,10 +392,10 @@ class _Run:
 
         Raises:
             PlacementError: no frame shows a credible target.
-            DeviceError: a device is in lasting trouble.
+            DeviceError: a device is in lasting trouble, or the pose changed at rest.
         """
         setup = self.job.setup
-        steady = session.poses.steady(setup.settle_s)
+        pose = stage.resting_pose(setup.settle_s)
         if self.job.request.by_image:
             measurement, amplitude = stage.locate(row)
         else:
@@ -398,7 +403,7 @@ class _Run:
             measurement, amplitude = median_times(heard)
         stage.check()
         session.record_image()
-        return _Shot(steady.sample.pose, measurement, amplitude)
+        return _Shot(pose, measurement, amplitude)
 
     def _select(self, row: int, placement: Placement, shot: _Shot, began: float) -> None:
         """Put the image among those of the calibration, and solve again."""

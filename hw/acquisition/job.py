@@ -15,10 +15,10 @@ from hw.recording.file import RecordingWriter
 from hw.recording.layout import RecordingHeader
 from hw.recording.recorder import Recorder
 from hw.recording.resuming import (
-    check_same_clock,
     check_same_robot,
     compare,
     described,
+    described_electronics,
     described_probe,
 )
 from hw.recording.session import Session
@@ -101,6 +101,8 @@ def open_recorder(path: str | os.PathLike[str], job: Job) -> Recorder:
     )
     recorder = Recorder(path, header)
     recorder.put("plan", "targets", job.targets, "mm")
+    # A recording that is there can be resumed, whatever happens next.
+    recorder.sync()
     return recorder
 
 
@@ -108,8 +110,7 @@ def motion_plan(job: Job, session: Session) -> MotionPlan:
     """The plan that the confirmation is bound to; on resume the robot must be the same one.
 
     Raises:
-        RefusedError: another robot, electronics with another clock, or a controller that does not
-            report what must be confirmed.
+        RefusedError: another robot, or a controller that does not report what must be confirmed.
     """
     identity = session.poses.identity()
     if identity.remote is False:
@@ -122,7 +123,6 @@ def motion_plan(job: Job, session: Session) -> MotionPlan:
         )
     if job.progress is not None:
         check_same_robot(job.progress.settings.get("robot"), identity.name, offset)
-        check_same_clock(job.progress.settings.get("active_echo"), session.echo.clock_hz())
     pendant = session.poses.pendant
     if pendant is None:
         raise refused("the controller does not report its speed slider")
@@ -163,16 +163,10 @@ def record_confirmed(job: Job, plan: MotionPlan, session: Session, recorder: Rec
     """
     known = {"serial_number": plan.serial, "tcp_offset": list(plan.tcp_offset)}
     bench = described(job.setup, job.targets)
-    echo = {"clock_hz": session.echo.clock_hz()}
-    settings = {
-        "request": asdict(job.request),
-        "robot": known,
-        "bench": bench,
-        "active_echo": echo,
-    }
+    settings = {"request": asdict(job.request), "robot": known, "bench": bench}
     recorder.put("plan", "settings", np.frombuffer(json.dumps(settings).encode(), np.uint8), "1")
     recorder.attributes("tracker", known)
-    recorder.attributes("ae", {**echo, "trigger_delay_s": 0.0})
+    recorder.attributes("ae", {**described_electronics(session.echo), "trigger_delay_s": 0.0})
     recorder.sync()
 
 

@@ -16,7 +16,7 @@ from hw.midplane.search import Echoes, PlacementError
 from hw.recording.session import Session
 from hw.robot.motion import Motion
 from hw.robot.stream import PoseSample
-from hw.runtime.errors import RefusedError, StaleError
+from hw.runtime.errors import RefusedError, StaleError, refused
 from hw.runtime.rigid import turn_deg
 from hw.ultrasound.receiver import Image
 from jaxcal.data.segmentation.image import localise
@@ -29,6 +29,8 @@ IMAGE_AGE_S = 0.2
 _NEAR_MM = 12.0
 """The drawing gives the target's place in the image to better than this: mount and target are off
 by some millimetres and degrees."""
+_DRIFT_MM = 0.5
+"""A resting arm's pose changes by less; a degree counts as a mm."""
 _LOOKS = 5
 """Frames to look at before a place without a credible target is given up."""
 
@@ -57,6 +59,8 @@ class ProbeStage:
         self._before: Image | None = None
         """The newest image before the last journey."""
         self._arrived = session.clock.now()
+        self._rests_at: np.ndarray | None = None
+        """Pose in which the last move ended."""
 
     def go_to(self, row: int) -> None:
         """Travel to a pose of the plan; offsets count from there.
@@ -206,6 +210,24 @@ class ProbeStage:
         self._session.check()
         self._motion.check()
 
+    def resting_pose(self, seconds: float) -> Float[np.ndarray, "4 4"]:
+        """The mean pose of the next bench seconds, (4, 4) mm.
+
+        Raises:
+            RefusedError: it is not the pose in which the last move ended. Controllers of the CB
+                series do not tell their TCP offset among the poses, and it is read only before a
+                move: an image after the last one would have a wrong pose.
+            DeviceError: the connection was lost, or too few poses came.
+        """
+        pose = self._session.poses.steady(seconds).sample.pose
+        drift = 0.0 if self._rests_at is None else _apart(self._rests_at, pose)
+        if drift > _DRIFT_MM:
+            raise refused(
+                f"the pose changed by {drift:.1f} mm or degrees while the robot was at rest: set "
+                "the TCP offset as before, and do not move the arm by hand"
+            )
+        return pose
+
     @property
     def arrived_s(self) -> float:
         """Bench time since which neither the probe nor the threshold has changed."""
@@ -221,7 +243,7 @@ class ProbeStage:
                     raise
                 self._note("hesitation", str(error))
                 continue
-            self._arrived = self._session.clock.now()
+            self._arrived, self._rests_at = self._session.clock.now(), sample.pose
             return sample
         raise AssertionError
 

@@ -117,6 +117,7 @@ class AuspisEmulator:
         self._plugged = True
         self._thread = self._new_thread()
         self.path = self._link.url
+        self.identity = "jaxcal,active-echo emulator,SN0001,1.0"
         self.injection = Injection()
         self.sent = 0
         self.refused = 0
@@ -288,7 +289,7 @@ class AuspisEmulator:
     def _answer(self, word: str, argument: str) -> str:
         match word:
             case "*IDN?":
-                return "jaxcal,active-echo emulator,SN0001,1.0"
+                return self.identity
             case "SYST:ERR?":
                 return self._errors.popleft() if self._errors else "0,none"
             case "CLK?":

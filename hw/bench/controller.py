@@ -75,6 +75,8 @@ class Controller:
     """Why the program last stopped."""
     payload_kg: float = 0.0
     payload_cog_m: tuple[float, ...] = (0.0, 0.0, 0.0)
+    overspeed: float = 1.0
+    """A fault: motions are so many times as fast as commanded."""
     speed_fraction: float = 1.0
     """Position of the speed slider, 0 to 1."""
     told: Callable[[str, bool], None] = field(default=lambda reason, fault: None, repr=False)
@@ -261,7 +263,8 @@ class Controller:
             return
         if self._finishes is not None:
             self._finish()
-        arrival = self.arm.move_linear(t, d[:6], d[6] * max(self.speed_fraction, 1e-3), d[7])
+        scale = self.overspeed * max(self.speed_fraction, 1e-3)
+        arrival = self.arm.move_linear(t, d[:6], d[6] * scale, d[7])
         if self.int_in[1]:
             self._progress(0)
             self._finishes = arrival

@@ -36,7 +36,7 @@ E_SERIES, CB_SERIES = (5, 11, 0, 108249), (3, 15, 8, 106339)
 
 _FAULTS = (
     *("mute", "drop", "protective_stop", "unlock", "enter", "play", "set_remote"),
-    *("set_tcp_offset", "set_payload", "set_speed_slider", "spoil_dashboard"),
+    *("set_tcp_offset", "set_payload", "set_speed_slider", "set_overspeed", "spoil_dashboard"),
 )
 """Methods of the server that may be asked for."""
 _PATIENCE_S = 30.0

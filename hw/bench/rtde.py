@@ -254,6 +254,11 @@ class RtdeServer:
         """What a person does at the pendant; motions from now on are slower."""
         self.controller.speed_fraction = float(fraction)
 
+    @_in_the_loop
+    def set_overspeed(self, factor: float) -> None:
+        """Motions from now on are so many times as fast as commanded."""
+        self.controller.overspeed = float(factor)
+
     def _call(self, act: Callable[[], None]) -> None:
         if self._thread is None or threading.current_thread() is self._thread:
             act()

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import select
 import sys
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 import click
@@ -14,6 +16,9 @@ if TYPE_CHECKING:
     from hw.robot.confirmation import Confirmation
     from hw.robot.motion_plan import MotionPlan
     from hw.runtime.clock import Clock
+
+
+_TURN_S = 0.1
 
 
 def confirming_by(clock: Clock, emulated: bool, unattended: str | None) -> Confirm:
@@ -35,12 +40,12 @@ def confirming_by(clock: Clock, emulated: bool, unattended: str | None) -> Confi
             f"{challenge.code} to let it move.",
             err=True,
         )
-        return confirm(challenge, _typed_code(), clock=clock)
+        return confirm(challenge, typed_code(), clock=clock)
 
     return ask
 
 
-def _typed_code() -> str:
+def typed_code() -> str:
     """What the operator types.
 
     Raises:
@@ -49,12 +54,22 @@ def _typed_code() -> str:
     """
     from hw.runtime.errors import refused
 
-    if sys.stdin is not None:
-        try:
-            return click.prompt("code", err=True)
-        except click.Abort:
-            # Ctrl-C, or the end of standard input.
-            heed_interrupt()
+    # A terminal that is gone, or bytes that are no text.
+    with suppress(OSError, ValueError):
+        while sys.stdin is not None:
+            click.echo("code: ", nl=False, err=True)
+            # Python handles a signal that comes right before a read only after it: wait in turns.
+            while (
+                sys.platform != "win32"
+                and sys.stdin.isatty()
+                and not select.select([sys.stdin], [], [], _TURN_S)[0]
+            ):
+                heed_interrupt()
+            line = sys.stdin.readline()
+            if line.strip():
+                return line
+            if not line:
+                break
     raise refused(
         "not confirmed: standard input ended before the code was typed; run it at a terminal, or "
         "name the plan with --unattended DIGEST"

@@ -70,7 +70,7 @@ def acquire_free_hand(
             recorder = Recorder(path)
         else:
             known = {**asked.settings(posed.pair), "image_spacing_mm": posed.spacing_mm}
-            header = RecordingHeader("pixel", {}, 0, None, json.dumps({_KIND: known}))
+            header = RecordingHeader("pixel", {}, 0, settings=json.dumps({_KIND: known}))
             recorder = Recorder(path, header)
         # Recordings of older versions do not tell it.
         run = _Run(asked, guide, person, posed, recorder, kept, spacing or posed.spacing_mm)

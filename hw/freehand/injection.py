@@ -33,10 +33,15 @@ from hw.midplane.bracket import Bracket
 from hw.midplane.live_view import describe, profile
 from hw.midplane.pattern_injection import View, bar, bar_length, sides_seen
 from hw.midplane.search import Echoes, PlacementError
-from hw.recording.check import probe_of
+from hw.recording.check import electronics_of, probe_of
 from hw.recording.layout import RecordingHeader
 from hw.recording.recorder import Recorder
-from hw.recording.resuming import check_same, described_probe
+from hw.recording.resuming import (
+    check_same,
+    compare_electronics,
+    described_electronics,
+    described_probe,
+)
 from hw.recording.session import DELAY_S, Watch, median_times
 from hw.runtime.errors import DeviceError, StaleError
 from hw.setup.description import HandHeldSetup
@@ -110,12 +115,13 @@ def acquire_by_injection(
         InputError: a recording that cannot be resumed, or was begun with another probe or drawing.
         OutputError: the recording cannot be made.
     """
-    kept, probe = KeptImages(), setup.probe
+    kept, probe, before = KeptImages(), setup.probe, {}
     if resume:
         asked, told = recorded_request(path, _KIND, asked)
         with naming(path):
             check_same("probe", probe_of(path), described_probe(probe))
             check_same("scene", told.get("scene"), _scene(setup))
+        before = electronics_of(path)
         kept = KeptImages(read_images(path))
     with contextlib.ExitStack() as stack:
         stream = stack.enter_context(UltrasoundStream(asked.host, asked.port, device=asked.device))
@@ -125,10 +131,16 @@ def acquire_by_injection(
         stack.callback(_switch_off, echo)
         echo.set_threshold(setup.search.low_threshold)
         echo.stream(True)
-        recorder = _recorder(path, asked, setup, posed, echo, resume)
+        unit = described_electronics(echo)
+        changes = compare_electronics(before, unit)
+        recorder = Recorder(path) if resume else _recorder(path, asked, setup, posed)
         try:
             with recorder:
-                return _Run(asked, setup, person, posed, echo, recorder, kept).go()
+                recorder.attributes("ae", unit)
+                run = _Run(asked, setup, person, posed, echo, recorder, kept)
+                for change in changes:
+                    run.note("changed", change)
+                return run.go()
         except KeyboardInterrupt:
             reason, interrupted = "interrupted", True
         except (DeviceError, CalibrationError) as error:
@@ -148,18 +160,13 @@ def _recorder(
     asked: FreeHand,
     setup: HandHeldSetup,
     posed: PosedImages,
-    echo: ActiveEcho,
-    resume: bool,
 ) -> Recorder:
-    if resume:
-        return Recorder(path)
     probe = setup.probe
     known = {**asked.settings(posed.pair), "scene": _scene(setup), "search": asdict(setup.search)}
     header = RecordingHeader(
         kind="time_of_flight",
         probe={"kind": probe.kind, **described_probe(probe)},
         lines=probe.elements,
-        attributes={"ae": {"clock_hz": echo.clock_hz()}},
         settings=json.dumps({_KIND: known}),
     )
     return Recorder(path, header)
@@ -203,7 +210,7 @@ class _Run:
 
     def go(self) -> int:
         """Run until enough images are accepted, or the person ends it."""
-        self._note("started", f"{self._asked.images - self.count} images to take")
+        self.note("started", f"{self._asked.images - self.count} images to take")
         while self.count < self._asked.images:
             key = self._person.key()
             if key == "q":
@@ -218,7 +225,7 @@ class _Run:
             self._show()
         if self.count < MINIMUM_IMAGES:
             raise InputError(f"{self.count} images are too few: {MINIMUM_IMAGES} are needed")
-        self._note("finished", f"{self.count} images")
+        self.note("finished", f"{self.count} images")
         self._recorder.finish()
         return self.count
 
@@ -449,9 +456,10 @@ class _Run:
         if not self._kept:
             return
         self._kept.take_back(self._recorder)
-        self._note("taken back", f"the last image; {self.count} are left")
+        self.note("taken back", f"the last image; {self.count} are left")
 
-    def _note(self, kind: str, text: str) -> None:
+    def note(self, kind: str, text: str) -> None:
+        """Say a line, and put it among the recording's events."""
         self._recorder.add_event(kind, text, time.monotonic())
         self._person.say(f"{kind}: {text}")
 

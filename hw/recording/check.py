@@ -107,6 +107,7 @@ class Progress:
         true_elevation: (k,) mm, NaN on a real bench.
         last_s: latest host time in the file.
         probe: numbers of /probe: elements, pitch_mm, sound_speed_m_s, delay_s.
+        electronics: see :func:`electronics_of`.
         ended: whether a run came to its end before, with poses skipped or given up.
     """
 
@@ -119,6 +120,7 @@ class Progress:
     true_elevation: np.ndarray
     last_s: float
     probe: dict[str, float]
+    electronics: dict[str, object]
     ended: bool
 
 
@@ -153,6 +155,7 @@ def read_progress(path: str | os.PathLike[str]) -> Progress:
             true_elevation=read_column(root, "placement", "true_elevation", (images,)),
             last_s=max(last),
             probe=_probe(root),
+            electronics=_electronics(root),
             ended=_lacks_images(root),
         )
 
@@ -175,6 +178,16 @@ def probe_of(path: str | os.PathLike[str]) -> dict[str, float]:
     """
     with opened(path) as root:
         return _probe(root)
+
+
+def electronics_of(path: str | os.PathLike[str]) -> dict[str, object]:
+    """``clock_hz`` and ``identity`` of the electronics of a recording, as far as it has them.
+
+    Raises:
+        FormatError: not an acquisition's recording; the file is not trusted.
+    """
+    with opened(path) as root:
+        return _electronics(root)
 
 
 @contextmanager
@@ -203,6 +216,12 @@ def _probe(root: Node) -> dict[str, float]:
     node = _existing(root, "probe")
     names = ("elements", "pitch_mm", "sound_speed_m_s", "delay_s")
     found = {name: number(node, name) for name in names}
+    return {name: value for name, value in found.items() if value is not None}
+
+
+def _electronics(root: Node) -> dict[str, object]:
+    node = _existing(root, "ae")
+    found = {"clock_hz": number(node, "clock_hz"), "identity": text(node, "identity")}
     return {name: value for name, value in found.items() if value is not None}
 
 

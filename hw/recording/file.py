@@ -432,9 +432,6 @@ def _write_skeleton(file: h5py.File, header: RecordingHeader) -> None:
         if name != "us" and (name != "ae" or header.lines):
             _make_columns(target, wanted, sizes)
     file["us"].attrs["orientation"] = "MF"
-    for name, values in (header.attributes or {}).items():
-        for key, value in values.items():
-            file.require_group(name).attrs[key] = _plain(value)
     settings = header.settings.encode()
     if len(settings) > LARGEST_SETTINGS:
         raise OutputError(f"the settings are too long: {len(settings)} bytes")

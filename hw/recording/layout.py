@@ -155,12 +155,10 @@ class RecordingHeader:
             /probe.
         lines: transmitted lines of the active echo element (times of flight in a frame); 0: there
             is none.
-        attributes: of other groups, by name: {"ae": {"clock_hz": 1e8}}.
         settings: JSON text of how the acquisition was asked for; ``--resume`` uses it.
     """
 
     kind: str
     probe: Mapping[str, float | int | str]
     lines: int = 128
-    attributes: Mapping[str, Mapping[str, object]] | None = None
     settings: str = "{}"

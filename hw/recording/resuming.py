@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,8 +22,12 @@ from jaxcal import InputError
 from jaxcal.data.probe import LinearProbe
 from jaxcal.runtime.messages import quoted
 
+if TYPE_CHECKING:
+    from hw.active_echo.device import ActiveEcho
+
 _SAME = 1e-9
 """Relative difference below which two numbers are the same."""
+_LONGEST_IDENTITY = 200
 
 
 def described(setup: Setup, targets: np.ndarray) -> dict[str, Any]:
@@ -128,15 +132,37 @@ def check_same_robot(before: object, serial: str, tcp_offset: Sequence[float]) -
     raise refused(f"{what}: its images would not fit together")
 
 
-def check_same_clock(before: object, clock_hz: float) -> None:
-    """Refuse electronics with another clock: all ticks of a recording are of one clock."""
-    known = before.get("clock_hz") if isinstance(before, dict) else None
-    if known is not None and not _same(known, clock_hz):
+def described_electronics(echo: ActiveEcho) -> dict[str, float | str]:
+    """What a recording keeps of its electronics, as attributes of /ae."""
+    # A device may say anything, but HDF5 takes no text with zeros in it.
+    identity = ascii(echo.identify())[1:-1][:_LONGEST_IDENTITY]
+    return {"clock_hz": echo.clock_hz(), "identity": identity}
+
+
+def compare_electronics(kept: Mapping[str, object], now: Mapping[str, float | str]) -> list[str]:
+    """Whether the electronics are those of a recording.
+
+    Args:
+        kept: what the recording has of :func:`described_electronics`.
+        now: of the electronics at hand.
+
+    Returns:
+        A line that says so if they are another unit, or have another firmware: with the same clock
+        their frames mean the same.
+
+    Raises:
+        RefusedError: they have another clock: all ticks of a recording are of one clock.
+    """
+    clock, unit = kept.get("clock_hz"), kept.get("identity")
+    if clock is not None and not _same(clock, now["clock_hz"]):
         raise RefusedError(
-            f"the recording was begun with electronics that count {_shown(known)} ticks a second, "
-            f"these count {_shown(clock_hz)}: their frames would not fit together",
+            f"the recording was begun with electronics that count {_shown(clock)} ticks a second, "
+            f"these count {_shown(now['clock_hz'])}: their frames would not fit together",
             device="active echo",
         )
+    if unit in (None, now["identity"]):
+        return []
+    return [f"the electronics were {_shown(unit)}, are {_shown(now['identity'])} from here on"]
 
 
 def _same(old: Any, new: Any) -> bool:

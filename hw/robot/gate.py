@@ -40,7 +40,10 @@ class Command:
     """Target: m and rotation vector (rad)."""
     pose: np.ndarray
     """(4, 4) mm, the same target."""
+    speed_mm_s: float
+    """Bound of the speed of TCP and tip."""
     speed_m_s: float
+    """As the controller takes it (:func:`hw.robot.path_checks.pace`)."""
     acceleration_m_s2: float
     duration_s: float
     """Bench seconds that it should take."""
@@ -164,7 +167,7 @@ class Gate:
         if (
             not isinstance(speed, int | float)
             or isinstance(speed, bool)
-            or not min(_LEAST_SPEED_MM_S, cap) <= speed <= cap
+            or not _LEAST_SPEED_MM_S <= speed <= cap
         ):
             raise refused(
                 f"a speed of {speed!r} mm/s is not within {_LEAST_SPEED_MM_S:g} and {cap:g} mm/s"
@@ -177,6 +180,7 @@ class Gate:
             near[0],
             tuple(float(v) for v in pose_to_ur(goal)),
             goal,
+            speed,
             velocity,
             acceleration,
             # The speed slider slows the whole motion down, as it was when the plan was made.

@@ -9,8 +9,8 @@ A stop is latched on both sides of the pipe: here in :attr:`Motion._stop`, in th
 described in :mod:`hw.robot.mover.control_loop`. There are two kinds of stops.
 
 - A *stop* (:meth:`Motion.stop`, a guard that reports danger or fails, a log that fails, an
-  interrupt such as Ctrl-C, a suspension of this process for more than 10 s, force, the box, a
-  protective stop, a motion that does not arrive) ends motion: :attr:`Motion.ended` is true, every
+  interrupt such as Ctrl-C, a suspension of this process for more than 10 s, force, speed, the box,
+  a protective stop, a motion that does not arrive) ends motion: :attr:`Motion.ended` is true, every
   later move is refused, and only a new confirmation lets the robot move again.
 - A *hesitation* (StaleError: poses, echo frames, images or this process were silent for a moment)
   stops the robot in the same way, but the same move may be asked for again. Nothing said that
@@ -185,8 +185,8 @@ class Motion:
                 offset, payload or speed slider was changed: then the robot was stopped, and motion
                 needs a new confirmation (:attr:`ended` tells).
             StaleError: a hesitation; the robot rests, and the move may be asked for again.
-            StoppedError: stopped before arrival: by :meth:`stop`, the guard, force, the box, a
-                protective stop, or because it took too long. Motion needs a new confirmation.
+            StoppedError: stopped before arrival: by :meth:`stop`, the guard, force, speed, the box,
+                a protective stop, or because it took too long. Motion needs a new confirmation.
             LostError: the connection is gone; motion needs a new confirmation.
         """
         with self._one_at_a_time:

@@ -76,7 +76,9 @@ class Pause:
 
     def wait(self) -> None:
         """Return when nobody holds the acquisition."""
-        self._free.wait()
+        # Python handles a signal that comes right before an endless wait only after it.
+        while not self._free.wait(_PERIOD_S):
+            pass
 
 
 class Keyboard:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Collection
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -188,10 +188,27 @@ def load_setup(path: str | os.PathLike[str]) -> Setup:
     with naming(path):
         setup = _setup(tables)
         try:
-            setup.motion_limits()
+            limits = setup.motion_limits()
         except RefusedError as error:
             raise InputError(f"[limits] {error.args[0]}") from None
-    return setup
+        reach = _reach_mm("reach_mm" in tables.get("search", {}), setup.search, limits)
+        return replace(setup, search=replace(setup.search, reach_mm=reach))
+
+
+def _reach_mm(given: bool, search: Settings, limits: Limits) -> float:
+    """How far the search may go: as far as the limits allow, unless the setup says less."""
+    allowed = limits.search_mm
+    if given and search.reach_mm > allowed:
+        raise InputError(
+            f"[search] reach_mm is {search.reach_mm:g}, but [limits] search_mm allows only "
+            f"{allowed:g}: such moves would be refused at the robot"
+        )
+    if allowed <= search.backlash_mm:
+        raise InputError(
+            f"[limits] search_mm of {allowed:g} leaves no room for the search, which comes to "
+            f"every place from {search.backlash_mm:g} mm below"
+        )
+    return min(search.reach_mm, allowed)
 
 
 _PLAN_SHAPES = {"depth_mm": (2,), "reach_mm": (2,), "box_mm": (2, 3)}

@@ -12,6 +12,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -52,7 +53,7 @@ from hw.runtime.keys import Pause
 from hw.setup.check import check
 from hw.setup.description import Setup
 from hw.setup.emulated import BenchOracle, setup_of, start
-from jaxcal import InputError
+from jaxcal import InputError, OutputError
 from jaxcal.cli.main import main
 
 IMAGES = 5
@@ -580,26 +581,43 @@ def test_a_resumed_plan_holds_the_poses_that_the_way_leads_through():
         np.testing.assert_array_equal(plan.targets, whole.targets[rows])
 
 
-def test_a_resumed_run_needs_electronics_with_the_same_clock(e_series, tmp_path):
-    """The ticks of its new frames would be read as those of the old clock, or the reverse."""
+def test_a_recording_whose_writer_is_killed_at_once_is_resumed(e_series, tmp_path):
+    """It was refused as not made by an acquisition, and a new one as one to resume."""
+    path, setup = tmp_path / "rec.h5", setup_of(e_series)
+    job = prepare(setup, path, AcquisitionRequest(4, "none", 1, bench=3))
+    with suppress(OutputError), open_recorder(path, job) as recorder:
+        recorder._process.kill()
+        recorder._process.wait()
+    assert prepare(setup, path, None).missing == [0, 1, 2, 3]
+
+
+def test_a_resumed_run_compares_the_electronics(e_series, tmp_path):
+    """With another clock, ticks would mean two things; another unit is told of."""
     path, setup = tmp_path / "rec.h5", setup_of(e_series)
     job = prepare(setup, path, AcquisitionRequest(4, "none", 1, bench=3))
     with open_recorder(path, job) as recorder, Session(setup, recorder) as session:
         record_confirmed(job, motion_plan(job, session), session, recorder)
-    resumed = prepare(setup, path, None)
 
     def silence(t: float, threshold: int) -> tuple[np.ndarray, np.ndarray]:
         return np.full(setup.probe.elements, np.nan), np.zeros(setup.probe.elements)
 
-    with (
-        AuspisEmulator(
-            silence, clock=setup.clock, lines=setup.probe.elements, clock_hz=80e6
-        ) as other,
-        open_recorder(path, resumed) as recorder,
-        Session(replace(setup, active_echo_url=other.path), recorder) as session,
-        pytest.raises(RefusedError, match=r"active echo: .* 100000000\.0 ticks .* 80000000\.0:"),
+    def refuse(plan: MotionPlan):
+        raise RefusedError("not confirmed", device="robot")
+
+    for clock_hz, stopped in (
+        (80e6, r"active echo: .* 100000000\.0 ticks .* 80000000\.0:"),
+        (100e6, "not confirmed"),
     ):
-        motion_plan(resumed, session)
+        told = []
+        with AuspisEmulator(
+            silence, clock=setup.clock, lines=setup.probe.elements, clock_hz=clock_hz
+        ) as other:
+            other.identity = "another unit"
+            bench = replace(setup, active_echo_url=other.path)
+            with pytest.raises(AcquisitionStopped, match=stopped):
+                acquire(bench, path, None, refuse, say=told.append)
+    was = '"jaxcal,active-echo emulator,SN0001,1.0"'
+    assert f'changed: the electronics were {was}, are "another unit" from here on' in told
 
 
 @pytest.mark.parametrize(

@@ -32,6 +32,7 @@ from hw.planning.poses import Extent, plan_poses
 from hw.recording.layout import RecordingHeader
 from hw.recording.recorder import Recorder
 from hw.runtime.clock import REAL
+from hw.runtime.errors import RefusedError
 from hw.setup.description import HandHeldSetup, load_hand_held
 from hw.ultrasound import Image
 from jaxcal import InputError
@@ -211,7 +212,15 @@ def test_a_person_follows_the_bar_by_hand(tmp_path, bench):
             acquire_by_injection(
                 path, bench.asked, replace(bench.setup, **other), person, resume=True
             )
+    with AuspisEmulator(
+        lambda t, threshold: (np.full(128, np.nan), np.zeros(128)), clock=REAL, clock_hz=80e6
+    ) as other:
+        electronics = replace(bench.setup, active_echo_url=other.path)
+        with pytest.raises(RefusedError, match=r"100000000\.0 ticks .* 80000000\.0:"):
+            acquire_by_injection(path, bench.asked, electronics, person, resume=True)
+    bench.echo.identity = "another\0unit"
     assert acquire_by_injection(path, bench.asked, bench.setup, person, resume=True) == 4
+    assert any(re.search(r'are "another.+unit" from here on', line) for line in person.lines)
     assert "started: 3 images to take" in person.lines
     assert "taken back: the last image; 1 are left" in stopping.lines
     assert not bench.echo.injection.on
@@ -256,7 +265,7 @@ def test_enter_is_refused_until_both_sides_were_seen(tmp_path, bench):
     person = Hasty(bench.hand)
     with pytest.raises(FreeHandStopped, match="0 images are too few"):
         acquire_by_injection(tmp_path / "r.h5", bench.asked, bench.setup, person)
-    Recorder(tmp_path / "o.h5", RecordingHeader("pixel", {}, 0, None, "{}")).close()
+    Recorder(tmp_path / "o.h5", RecordingHeader("pixel", {}, 0, settings="{}")).close()
     with pytest.raises(InputError, match="has no settings of a pattern-injection run"):
         acquire_by_injection(tmp_path / "o.h5", bench.asked, bench.setup, person, resume=True)
 

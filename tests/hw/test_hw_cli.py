@@ -116,7 +116,7 @@ def test_a_recording_of_the_bench_is_resumed_on_the_bench(tmp_path, capsys):
     probe = {"kind": "linear", "elements": 8, "pitch_mm": 1.0, "sound_speed_m_s": 1490.0}
     settings = json.dumps({"request": {"images": 5, "bench": 0}})
     RecordingWriter.create(
-        path, RecordingHeader("time_of_flight", probe, 8, None, settings)
+        path, RecordingHeader("time_of_flight", probe, 8, settings=settings)
     ).close()
     assert main(["acquire", str(path), "--setup", "x.toml", "--resume", "--move"]) == 2
     assert "begun on the emulated bench" in capsys.readouterr().err
@@ -128,7 +128,9 @@ def test_a_recording_of_the_bench_is_resumed_on_the_bench(tmp_path, capsys):
 def test_a_recording_that_lacks_images_can_be_resumed_after_its_end(tmp_path):
     path, digest = tmp_path / "rec.h5", tmp_path / "rec.h5.sha256"
     probe = {"kind": "linear", "elements": 8, "pitch_mm": 1.0, "sound_speed_m_s": 1490.0}
-    writer = RecordingWriter.create(path, RecordingHeader("time_of_flight", probe, 8, None, "{}"))
+    writer = RecordingWriter.create(
+        path, RecordingHeader("time_of_flight", probe, 8, settings="{}")
+    )
     writer.put("plan", "targets", np.tile(np.eye(4), (5, 1, 1)), "mm")
     writer.attributes("plan", {"without_image": 2})
     writer.finish()
@@ -149,7 +151,7 @@ def test_a_refused_resume_leaves_a_complete_recording_as_it_is(tmp_path, capsys)
     probe = {"kind": "linear", "elements": 8, "pitch_mm": 1.0, "sound_speed_m_s": 1490.0}
     settings = json.dumps({"request": {"bench": 0, "of another version": 1}})
     writer = RecordingWriter.create(
-        path, RecordingHeader("time_of_flight", probe, 8, None, settings)
+        path, RecordingHeader("time_of_flight", probe, 8, settings=settings)
     )
     writer.put("plan", "targets", np.tile(np.eye(4), (5, 1, 1)), "mm")
     writer.attributes("plan", {"without_image": 2})

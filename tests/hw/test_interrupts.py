@@ -10,7 +10,9 @@ import threading
 
 import pytest
 
+from hw.cli.confirming import typed_code
 from hw.runtime.interrupts import as_interrupts, heed_interrupt
+from hw.runtime.keys import Pause
 
 pytestmark = pytest.mark.skipif(
     threading.current_thread() is not threading.main_thread() or sys.platform == "win32",
@@ -50,3 +52,34 @@ def test_an_interrupt_that_python_drops_is_raised_again(monkeypatch, where):
                 heed_interrupt()
     heed_interrupt()
     assert signal.getsignal(signal.SIGTERM) is before
+
+
+@pytest.mark.parametrize("where", ["code", "pause"])
+def test_an_interrupt_right_before_an_endless_wait_ends_it(monkeypatch, where):
+    """As Ctrl-C in the moment in which the prompt appears: nothing interrupts the wait itself."""
+    pty = pytest.importorskip("pty", reason="there are no pseudo-terminals here")
+    keyboard, terminal = pty.openpty()
+    pause = Pause()
+    pause.hold()
+    late = threading.Event()
+
+    def give_up() -> None:
+        late.set()
+        pause.go_on()
+        os.write(keyboard, b"code\n")
+
+    # A signal that another thread takes does not end a read or a wait of the main thread.
+    timers = [
+        threading.Timer(0.2, signal.raise_signal, [signal.SIGINT]),
+        threading.Timer(5.0, give_up),
+    ]
+    wait = {"code": typed_code, "pause": pause.wait}[where]
+    with open(terminal, encoding="utf-8") as stdin, as_interrupts():
+        monkeypatch.setattr(sys, "stdin", stdin)
+        for timer in timers:
+            timer.start()
+        with pytest.raises(KeyboardInterrupt):
+            wait()
+        timers[1].cancel()
+    os.close(keyboard)
+    assert not late.is_set()

@@ -183,6 +183,19 @@ def check_fault(robot: EmulatedRobot, name: str, kind: type, text: str, ends: bo
         assert len(sent(robot, 3)) == moves
 
 
+def test_a_robot_that_is_faster_than_commanded_is_stopped(robots):
+    robot = robots["CB"]
+    put_in_order(robot)
+    robot.ask("set_overspeed", 2.0)
+    with moving(robot, caller_s=2.0) as motion:
+        target = farther(robot)
+        with pytest.raises(StoppedError, match=r"moves at \d+ mm/s: 50 mm/s was commanded"):
+            motion.move_to(target)
+        assert motion.ended
+    robot.ask("set_overspeed", 1.0)
+    assert abs(1000.0 * robot.state()["raw"][0] - target[0, 3]) > 1.0
+
+
 @pytest.mark.parametrize("dashboard", [None, ""], ids=["answers", "mute"])
 def test_a_motion_does_not_go_on_when_a_safeguard_stop_is_released(robots, dashboard):
     """Such a stop only pauses the program, and may be released by closing a gate."""

@@ -10,8 +10,10 @@ from contextlib import suppress
 import h5py
 import numpy as np
 import pytest
-from robots import EmulatedRobot
+from motions import PLAN, moving
+from robots import CB_SERIES, EmulatedRobot
 
+from hw.acquisition.stage import ProbeStage
 from hw.active_echo.device import ActiveEcho
 from hw.bench.active_echo import AuspisEmulator
 from hw.bench.ultrasound import ImageServer
@@ -20,6 +22,7 @@ from hw.recording.layout import RecordingHeader
 from hw.recording.recorder import Recorder
 from hw.recording.session import Session, frame_period
 from hw.runtime.clock import Clock
+from hw.runtime.errors import RefusedError
 from hw.setup.description import Setup
 from jaxcal.data.probe import LinearProbe
 
@@ -78,7 +81,7 @@ def test_an_image_that_a_slow_link_holds_up_is_not_of_the_next_pose(tmp_path):
         ImageServer(
             lambda t: np.full((40, 30), int(1000 * t) % 256, np.uint8), clock=robot.clock
         ) as machine,
-        Recorder(tmp_path / "r.h5", RecordingHeader("pixel", {}, 8, None, "{}")) as recorder,
+        Recorder(tmp_path / "r.h5", RecordingHeader("pixel", {}, 8, settings="{}")) as recorder,
     ):
         link = Link(machine)
         setup = Setup(
@@ -106,7 +109,7 @@ def test_images_of_a_machine_that_also_sends_rf(tmp_path):
             lambda t: np.full((40, 30), int(1000 * t) % 256, np.uint8),
             rf=lambda t: np.full((200, 8), int(1000 * t) % 1000, np.int16),
         ) as machine,
-        Recorder(path, RecordingHeader("pixel", {}, 8, None, "{}")) as recorder,
+        Recorder(path, RecordingHeader("pixel", {}, 8, settings="{}")) as recorder,
     ):
         setup = Setup(
             robot.host, emulator.path, scene, {}, (machine.host, machine.port),
@@ -125,3 +128,23 @@ def test_images_of_a_machine_that_also_sends_rf(tmp_path):
     with h5py.File(path) as file:
         assert file["us/frames"].shape[1:] == (40, 30)
         assert len(file["us/frames"]) >= 10
+
+
+def test_a_pose_that_changes_at_rest_is_no_pose_of_an_image(tmp_path):
+    """A CB controller does not tell its TCP offset, which is read only before the next move."""
+    pytest.importorskip("rtde_control", reason="ur_rtde has no wheel for this platform")
+    scene = Scene(np.eye(4), np.array([400.0, -100.0, 0.0]), np.array([0.0, 0.0, -1.0]))
+    with (
+        EmulatedRobot(version=CB_SERIES) as robot,
+        AuspisEmulator(silence, clock=robot.clock, lines=8) as emulator,
+        Recorder(tmp_path / "r.h5", RecordingHeader("pixel", {}, 8, settings="{}")) as recorder,
+    ):
+        probe = LinearProbe(elements=8)
+        setup = Setup(robot.host, emulator.path, scene, {}, probe=probe, clock=robot.clock)
+        with Session(setup, recorder) as session, moving(robot, caller_s=2.0) as motion:
+            stage = ProbeStage(session, motion, PLAN.targets, lambda kind, text: None)
+            stage.go_to(1)
+            np.testing.assert_allclose(stage.resting_pose(0.1), PLAN.targets[1], atol=0.2)
+            robot.set_tcp_offset((0.0, 0.0, 0.102, 0.0, 0.0, 0.0))
+            with pytest.raises(RefusedError, match="set the TCP offset as before"):
+                stage.resting_pose(0.1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -63,6 +64,8 @@ def test_a_description_is_read(tmp_path):
     assert (setup.search.fine_mm, setup.search.frames) == (0.2, 5)
     assert setup.limits["cone_deg"] == 60
     np.testing.assert_array_equal(setup.scene.tip_mm, [0, 0, 60])
+    path.write_text(GOOD.replace("search_mm = 25", "search_mm = 8"))
+    assert load_setup(path).search == replace(setup.search, reach_mm=8.0)
 
 
 @pytest.mark.parametrize(
@@ -99,6 +102,8 @@ def test_a_description_is_read(tmp_path):
         ('"192.168.1.20"', '"machine"\nport = 70000', r"\[ultrasound\] port must be 1 to 65535"),
         ('"192.168.1.10"', '"a..b"', r"\[robot\] host 'a\.\.b' is not the name or address"),
         ("[search]", "[serach]", "is not known"),
+        ("[search]", "[search]\nreach_mm = 30", r"\[search\] reach_mm is 30, but .* only 25"),
+        ("search_mm = 25", "", r"\[limits\] search_mm of 0 leaves no room for the search"),
         ("fine_mm = 0.2", "fine_mm = -0.2", "fine_mm"),
         ("cone_deg = 20", "cone_deg = 200", "cone_deg"),
         ("[robot]", "[robot", "is not TOML"),

@@ -90,7 +90,7 @@ def a_plan(setup: Setup, serial: str = "none") -> MotionPlan:
 @contextmanager
 def a_session(setup: Setup, folder: Path) -> Iterator[Session]:
     probe = {"kind": "linear", "elements": 128, "pitch_mm": 0.457, "sound_speed_m_s": 1490.0}
-    header = RecordingHeader("time_of_flight", probe, 128, None, "{}")
+    header = RecordingHeader("time_of_flight", probe, 128, settings="{}")
     with Recorder(folder / "rec.h5", header) as recorder, Session(setup, recorder) as session:
         yield session
 

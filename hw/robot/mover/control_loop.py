@@ -106,7 +106,7 @@ class ControlLoop:
                 self._caller.tell("alive")
 
     def _watch(self) -> None:
-        stop = self._monitor.trouble(moving=self._moving is not None)
+        stop = self._monitor.trouble(self._moving)
         if stop is not None:
             self._latch.set(stop)
 

@@ -1,7 +1,10 @@
-"""What must stop the robot: its own state, the program's, the connection's, force, box, silence."""
+"""What must stop the robot: state of robot, program and connection; force, speed, box, silence."""
 
 from __future__ import annotations
 
+import math
+
+from hw.robot.gate import Command
 from hw.robot.identity import LOCAL
 from hw.robot.mover.controller import Controller, unfit
 from hw.robot.mover.inputs import Inputs, lost
@@ -12,6 +15,9 @@ from hw.robot.rtde import PROGRAM_RUNS
 from hw.runtime.errors import StaleError, StoppedError
 
 _BOX_MARGIN_MM = 1.0
+_FASTER, _FASTER_MM_S = 1.2, 10.0
+"""The speed that the controller reports may be this many times the one commanded, and this more:
+room for its noise and for the overshoot of a real arm (assumptions)."""
 
 
 class Monitor:
@@ -26,11 +32,15 @@ class Monitor:
     def __init__(self, setup: Setup, inputs: Inputs, controller: Controller) -> None:
         self._limits, self._clock, self._caller_s = setup.plan.limits, setup.clock, setup.caller_s
         self._inputs, self._controller = inputs, controller
+        self._lever_mm = math.hypot(*self._limits.tip_mm)
 
-    def trouble(self, *, moving: bool) -> Stop | None:
+    def trouble(self, moving: Command | None) -> Stop | None:
         """Why the robot must stop, and whether that ends motion for good; None: it may go on.
 
         Every packet since the last call counts: a gate may have been open only for a moment.
+
+        Args:
+            moving: the motion that runs; None at rest.
 
         Raises:
             Ended: the connection is lost.
@@ -49,7 +59,7 @@ class Monitor:
             return Stop(self._controller.program_stopped(), True)
         if not self._controller.rtde_control.isConnected():
             return Stop(lost("the control connection is gone"), True)
-        if not moving:
+        if moving is None:
             return None
         sample, limits, now = inputs.sample, self._limits, self._clock.now()
         if sample.age_s(now) > self._clock.patience(limits.max_pose_age_s):
@@ -59,6 +69,11 @@ class Monitor:
         force = max(packet.force_n for packet in packets)
         if force > limits.max_force_n:
             return _for_good(f"a force of {force:.1f} N, over the cap of {limits.max_force_n:g} N")
+        speed = max(packet.speed_mm_s + packet.turning_rad_s * self._lever_mm for packet in packets)
+        if speed > _FASTER * moving.speed_mm_s + _FASTER_MM_S:
+            return _for_good(
+                f"the robot moves at {speed:.0f} mm/s: {moving.speed_mm_s:g} mm/s was commanded"
+            )
         out = out_of_box_mm(sample.pose, limits)
         if out > _BOX_MARGIN_MM:
             return _for_good(f"the probe is {out:.1f} mm out of the box")

@@ -209,6 +209,7 @@ cone_deg = 60
 max_step_mm = 250
 max_turn_deg = 120
 max_speed_mm_s = 50
+search_mm = 5
 """
 BOMBS = {
     "dotted key": (f"a{'.b' * 60_000} = 1\n", "a key of more than 8 parts in line 1"),

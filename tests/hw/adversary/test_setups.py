@@ -68,6 +68,8 @@ def test_the_good_setup_passes(tmp_path, capsys):
         ("[350, -250, 80]", "[0.35, -0.25, 0.08]", "mm from the robot's base: it is in mm"),
         ("0.12, 0, 0, 0]", "120, 0, 0, 0]", "120 m long: is it in mm?"),
         ("[limits]", "[probe]\npitch_mm = 0.000457\n[limits]", "pitch_mm is in mm"),
+        ("max_speed_mm_s = 50", "max_speed_mm_s = 0.05", "max_speed_mm_s must be above 0.25"),
+        ("[plan]", "max_acceleration_mm_s2 = 0.1\n[plan]", "mm_s2 must be above 2"),
         # A second tip.
         ("[limits]", "[limits]\ntip_mm = [0, 0, 0]", "contradicts [scene] image_to_probe"),
         ("[limits]", "[limits]\ntip_mm = [0, 0, 0.06]", "contradicts [scene] image_to_probe"),
