@@ -36,7 +36,7 @@ from jaxcal.study.simulation import Protocol
 
 FIGURES = ("residuals", "offsets", "accuracy", "influence", "limits")
 REPORT = {
-    "calibration.json", "verdict.txt", "residuals.csv",
+    "calibration.json", "verdict.txt", "residuals.csv", "test_residuals.csv",
     *(f"{name}.{kind}" for name in FIGURES for kind in ("png", "svg")),
 }  # fmt: skip
 DETERMINED = {name for name in REPORT if name.split(".")[0] in ("accuracy", "influence", "limits")}
@@ -73,6 +73,8 @@ SCHEMA = {
     "warnings": list,
     "source": str,
     "convention": dict,
+    "test_residual_mm": list,
+    "date": str,
     "jaxcal_version": str,
 }
 

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 import jaxcal
 from jaxcal import FormatError, InputError
 from jaxcal.cli.main import main
+from jaxcal.data.recording import joined
 from jaxcal.io.columns import columns_of_header
 from jaxcal.io.import_options import ImportOptions
 from jaxcal.io.importing import import_files
@@ -393,8 +394,17 @@ def test_points_of_a_sequence(tmp_path, sequence, name, text, points):
     assert "poses from Probe to Reference" in notes[0]
     assert "1 of 6 frames left out: their tracking was not OK" in notes
     tracker = ImportOptions(points=points, target="Tracker")
-    found = import_files([sequence, tmp_path / name], tracker)[0].calibration.poses
-    np.testing.assert_allclose(found, (random_poses(6, 9) @ POSES)[KEPT], atol=1e-11)
+    found = import_files([sequence, tmp_path / name], tracker)[0]
+    np.testing.assert_allclose(
+        found.calibration.poses, (random_poses(6, 9) @ POSES)[KEPT], atol=1e-11
+    )
+    assert recording.pose_frames == ("Probe", "Reference")
+    jaxcal.save(found, tmp_path / "r.h5")
+    kept = jaxcal.load(tmp_path / "r.h5")
+    assert kept.pose_frames == ("Probe", "Tracker")
+    assert joined(kept, kept).pose_frames == kept.pose_frames
+    with pytest.raises(InputError, match="from Probe to Reference, not from Probe to Tracker"):
+        joined(kept, recording)
 
 
 @pytest.mark.parametrize(
@@ -805,9 +815,9 @@ def test_images_are_added_to_a_recording(tmp_path, capsys):
     assert main(["import", more, out]) == 2
     assert main(["import", more, out, "--add-to", first]) == 0
     assert "- 2 images added to the 4 of " in capsys.readouterr().out
-    joined, whole = jaxcal.load(out).calibration, jaxcal.load(tmp_path / "all.h5").calibration
-    np.testing.assert_allclose(joined.poses, whole.poses, atol=1e-12)
-    np.testing.assert_array_equal(joined.measurements, whole.measurements)
+    both, whole = jaxcal.load(out).calibration, jaxcal.load(tmp_path / "all.h5").calibration
+    np.testing.assert_allclose(both.poses, whole.poses, atol=1e-12)
+    np.testing.assert_array_equal(both.measurements, whole.measurements)
     assert main(["import", second, out, "--add-to", first]) == 0
     assert len(jaxcal.load(out)) == 8
 

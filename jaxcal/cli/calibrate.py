@@ -155,6 +155,13 @@ EXPORTS: tuple[SaveFormat, ...] = ("plus", "slicer", "itk", "ros", "tusrec", "nu
     "the recording has them), with its interval.",
 )
 @click.option(
+    "--cone",
+    type=click.FloatRange(0, 85),
+    metavar="DEG",
+    help="Largest tilt of the poses that are advised, from the middle orientation of the images "
+    "(that of the images by default, at least 30), for a probe that cannot be tilted further.",
+)
+@click.option(
     "--require",
     type=click.Choice(WORDS),
     default=REQUIRED,
@@ -183,6 +190,7 @@ def calibrate(
     bootstrap: int | None,
     exports: tuple[str, ...],
     tre_points: tuple[tuple[float, float], ...],
+    cone: float | None,
     require: str,
     report: str | None,
     out: str | None,
@@ -225,6 +233,7 @@ def calibrate(
     from jaxcal.report.next_poses import next_poses_record
     from jaxcal.report.record import calibration_record, check_test_images
     from jaxcal.report.write import prepare_folder, write_report
+    from jaxcal.result.saved import dated
     from jaxcal.runtime.jax_cache import enable_compilation_cache
 
     measured, notes = segmented(load(recording))
@@ -244,11 +253,12 @@ def calibrate(
                 result = _solve(measured, request, traced=traced)
             record = calibration_record(result, measured, test_data, tre_points)
             record["warnings"] += notes
-            record["next_poses"] = next_poses_record(result, measured)
+            record["next_poses"] = next_poses_record(result, measured, cone)
         if cross_validate or bootstrap is not None:
             with progress("calibrating over and over"), naming(recording):
                 record |= _resampled(measured, request, result, cross_validate, bootstrap)
             settle(record)
+        record = dated(record)
         if folder is not None:
             with progress("drawing the report"):
                 curves = _curves(measured, request, result)

@@ -182,10 +182,17 @@ def patched(
         transform.plus_matrix(),
         out=out,
         error_mm=transform.error_mm,
-        date=datetime.datetime.now(),
+        date=_made(transform),
     )
     written = f"{config if out is None else out}: {frames[0]} to {frames[1]} written"
     return [written, *(f"- {note}" for note in notes)]
+
+
+def _made(transform: ImageTransform) -> datetime.datetime:
+    """When the calibration was made, in local time; the present where that is not known."""
+    if transform.date is None:
+        return datetime.datetime.now()
+    return datetime.datetime.fromisoformat(transform.date).astimezone()
 
 
 def sent(transform: ImageTransform, server: tuple[str, int], frames: tuple[str, str]) -> str:

@@ -116,6 +116,8 @@ class Recording:
         test: the images of an independent test set, or None.
         truth: the true values of a simulation, or None.
         probe: the transducer, or None.
+        pose_frames: names of the poses' two frames, that of the probe and that of the tracker, if
+            the file that the images came from states them.
         source: the file that it came from, for messages.
     """
 
@@ -124,6 +126,7 @@ class Recording:
     truth: Truth | None = None
     probe: Probe | None = None
     source: str = field(default="memory", compare=False)
+    pose_frames: tuple[str, str] | None = None
 
     def __post_init__(self) -> None:
         for name, images in (("calibration", self.calibration), ("test", self.test)):
@@ -155,7 +158,7 @@ def joined(first: Recording, second: Recording) -> Recording:
     truth of a simulation. Test images are those of the first.
 
     Raises:
-        InputError: the images differ in kind, size of a pixel or probe.
+        InputError: the images differ in kind, size of a pixel, probe or frames of the poses.
     """
     a, b = first.calibration, second.calibration
     where = f"{second.source} cannot be added to {first.source}"
@@ -169,6 +172,10 @@ def joined(first: Recording, second: Recording) -> Recording:
         )
     if None not in (first.probe, second.probe) and first.probe != second.probe:
         raise InputError(f"{where}: their probes differ")
+    frames = [each.pose_frames for each in (first, second)]
+    if None not in frames and frames[0] != frames[1]:
+        told = ", not ".join("from {} to {}".format(*pair) for pair in reversed(frames))  # pyright: ignore[reportOptionalIterable]
+        raise InputError(f"{where}: its poses lead {told} (import with --from and --to)")
 
     def both(name: str) -> Any:
         values = getattr(a, name), getattr(b, name)
@@ -182,6 +189,7 @@ def joined(first: Recording, second: Recording) -> Recording:
         truth=None,
         probe=first.probe or second.probe,
         source=f"{first.source} with {second.source}",
+        pose_frames=first.pose_frames or second.pose_frames,
     )
 
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import datetime
 import json
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 from zipfile import ZipFile
 
 import numpy as np
 
-from jaxcal import FormatError, InputError
+from jaxcal import FormatError, InputError, __version__
 from jaxcal.io.atomic import atomic_path, write_text
 from jaxcal.io.frame_names import FramePair, two_names
 from jaxcal.io.given_files import check_readable, naming, one_line, path_name, read_bytes
@@ -138,7 +140,8 @@ def save(
             else:
                 np.save(file, transform.plus_matrix())
     else:
-        write_text(path, text_of(transform, chosen, frames=frames))
+        dated = replace(transform, date=transform.date or utc_now())
+        write_text(path, text_of(dated, chosen, frames=frames))
 
 
 def text_of(transform: ImageTransform, format: SaveFormat, *, frames: FramePair) -> str:
@@ -179,6 +182,20 @@ def text_of(transform: ImageTransform, format: SaveFormat, *, frames: FramePair)
     raise InputError(f"{quoted(str(format))} is not a format that can be written")
 
 
+def utc_now() -> str:
+    """The present date and time in UTC, ISO 8601, to the second."""
+    now = datetime.datetime.now(datetime.UTC)
+    return now.isoformat(timespec="seconds").replace("+00:00", "Z")
+
+
+def dated(record: dict[str, Any]) -> dict[str, Any]:
+    """A calibration's record with the present date and time, for a file or a page.
+
+    Without them, equal calibrations have equal records.
+    """
+    return record | {"date": utc_now()}
+
+
 def left_out(transform: ImageTransform, format: SaveFormat) -> str | None:
     """What a format cannot hold and its user must do, in words; None where nothing is."""
     if format != "ros":
@@ -207,6 +224,8 @@ def _record(transform: ImageTransform) -> dict[str, Any]:
         "image_unknowns": tangent_names(transform.unknowns),
         "image_covariance": None if full is None else full.tolist(),
         "rms_mm": transform.error_mm,
+        "date": transform.date,
+        "jaxcal_version": __version__,
     }
 
 
@@ -345,6 +364,9 @@ def transform_from_record(record: dict[str, Any], *, source: str = "memory") -> 
     offset = _array(record, "face_offset_mm", ())
     factor = _array(record, "range_factor", ())
     error = _array(record, "rms_mm", ())
+    date = record.get("date")
+    if not (date is None or isinstance(date, str)):
+        raise FormatError("date must be text")
     usable = usable and not record.get("wrong_frames")
     unknowns = _unknowns(record)
     size = len(tangent_names(unknowns))
@@ -359,6 +381,7 @@ def transform_from_record(record: dict[str, Any], *, source: str = "memory") -> 
         1.0 if factor is None else float(factor),
         unknowns,
         _array(record, "image_covariance", (size, size)),
+        date,
     )
 
 
