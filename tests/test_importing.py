@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from jaxcal.data.recording import joined
 from jaxcal.io.columns import columns_of_header
 from jaxcal.io.import_options import ImportOptions
 from jaxcal.io.importing import import_files
+from jaxcal.io.plus import read_transform
 from jaxcal.io.sequence_files import read_sequence, write_sequence
 from jaxcal.io.slicer import read_markups
 from jaxcal.io.trackers import read_tracker
@@ -741,7 +743,8 @@ def test_import_calibrate_export(tmp_path, capsys):
     """The documented path, and its answer against the truth."""
     truth = burnt_sequence(tmp_path / "x.igs.mha")
     config = tmp_path / "config.xml"
-    lines = ["<PlusConfiguration>", " <CoordinateDefinitions>", " </CoordinateDefinitions>"]
+    old = ' <Transform From="Image" To="UsProbe" Matrix="1 0 0 0  0 1 0 0  0 0 1 0  0 0 0 1" />'
+    lines = ["<PlusConfiguration>", "<CoordinateDefinitions>", old, "</CoordinateDefinitions>"]
     config.write_bytes("\r\n".join([*lines, "</PlusConfiguration>", ""]).encode())
     recording = str(tmp_path / "out.h5")
     region = [str(value) for value in (COLUMN, ROW, WIDE, HIGH)]
@@ -750,16 +753,25 @@ def test_import_calibrate_export(tmp_path, capsys):
     # Frames in which a real reflection is as bright as the target are left out and counted.
     assert 24 <= int(re.search(r"out\.h5: (\d+) images, pixels", said)[1]) <= 27
     assert "1 of 28 frames left out: their tracking was not OK" in said
+    # The probe's marker has another name in this laboratory, in the recording as in PLUS.
+    named = replace(jaxcal.load(recording), pose_frames=("UsProbe", "Tracker"))
+    jaxcal.save(named, recording)
     arguments = ["--method", "conventional", "--estimate", "scale", "--json"]
     exported = ["--export", f"plus:{config}", "--export", f"slicer:{tmp_path / 'x.tfm'}"]
     assert main(["calibrate", recording, *arguments, *exported]) == 0
     (tmp_path / "cal.json").write_text(capsys.readouterr().out)
     found = jaxcal.load_calibration(tmp_path / "cal.json")
-    for other in (config, tmp_path / "x.tfm"):
-        matrix = jaxcal.load_calibration(other).plus_matrix()
+    slicer = jaxcal.load_calibration(tmp_path / "x.tfm").plus_matrix()
+    for matrix in (read_transform(config, "Image", "UsProbe").matrix, slicer):
         np.testing.assert_allclose(matrix, found.plus_matrix(), rtol=0, atol=1e-11)
+    assert config.read_text().count("<Transform ") == 1
+    for arguments, frame in (([], "UsProbe"), (["--probe-frame", "Wand"], "Wand")):
+        assert main(["export", str(tmp_path / "cal.json"), "--plus", *arguments]) == 0
+        assert f'From="Image" To="{frame}"' in capsys.readouterr().out
+    found.save(tmp_path / "again.json")
+    assert jaxcal.load_calibration(tmp_path / "again.json").probe_frame == "UsProbe"
     record = json.loads((tmp_path / "cal.json").read_text())
-    assert record["exported"][0] == f"{config}: Image to Probe written"
+    assert record["exported"][0] == f"{config}: Image to UsProbe written"
     assert record["exported"][-1] == f"{tmp_path / 'x.tfm'}: written"
     np.testing.assert_allclose(record["plus_image_to_probe"], found.plus_matrix(), atol=1e-12)
     # The error of X in its own frame, X Exp(d), against the stated covariance.

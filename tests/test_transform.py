@@ -607,12 +607,13 @@ import numpy as np
 from jaxcal import ImageTransform, InputError
 known = ImageTransform(np.eye(4), scale_mm_per_px=np.ones(2))
 for form in ("plus", "ros"):
-    for frames in ("Image", ("Image",), None, ("Image", 3), ("A", "B", "C")):
+    for frames in ("Image", ("Image",), (), ("Image", 3), ("A", "B", "C")):
         try:
             print(form, frames, known.text(form, frames=frames))
         except InputError as error:
             assert str(error).startswith("frames must be two names"), error
     assert known.text(form, frames=["Image", "Probe"]) == known.text(form)
+    assert known.text(form, frames=None) == known.text(form)
 """
 
 

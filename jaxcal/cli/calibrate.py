@@ -240,6 +240,7 @@ def calibrate(
     test_data = None if test is None else segmented(load(test))[0]
     check_test_images(measured, test_data)
     _check_pixels(measured, targets)
+    _check_configurations(measured, targets, inputs)
     enable_compilation_cache()
     with nullcontext() if out is None else prepare_folder(out) as folder:
         if report is not None:
@@ -277,7 +278,6 @@ def calibrate(
 
 
 def _export_target(text: str, inputs: list[str], out: str | None) -> tuple[SaveFormat, str]:
-    from jaxcal.cli.export import check_configuration
     from jaxcal.io.atomic import check_writable
     from jaxcal.result.saved import check_target
 
@@ -290,8 +290,6 @@ def _export_target(text: str, inputs: list[str], out: str | None) -> tuple[SaveF
         check_target(path, format, inputs)
     elif not Path(path).is_file():
         raise InputError(f"--export {text}: there is no such configuration")
-    else:
-        check_configuration(path, None, inputs)
     # The report's folder may not be there yet.
     if out is None or Path(path).parent != Path(out):
         check_writable(path)
@@ -328,6 +326,19 @@ def _check_pixels(recording: Recording, targets: list[tuple[SaveFormat, str]]) -
             )
 
 
+def _check_configurations(
+    recording: Recording, targets: list[tuple[SaveFormat, str]], inputs: list[str]
+) -> None:
+    """Refuse configurations of PLUS that cannot take the transform to the recording's probe."""
+    from jaxcal.cli.export import check_configuration
+    from jaxcal.result.saved import probe_frame
+
+    frames = "Image", probe_frame((recording.pose_frames or (None,))[0])
+    for format, path in targets:
+        if format == "plus":
+            check_configuration(path, None, inputs, frames)
+
+
 def _export(
     record: dict[str, Any], recording: str, targets: list[tuple[SaveFormat, str]]
 ) -> list[str]:
@@ -343,7 +354,7 @@ def _export(
     said: list[str] = []
     for format, path in targets:
         if format == "plus":
-            said += patched(transform, path, None, ("Image", "Probe"))
+            said += patched(transform, path, None, ("Image", transform.probe_frame))
         else:
             said += written(transform, path, format)
     return said

@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxcal import FormatError, InputError, __version__
 from jaxcal.io.atomic import atomic_path, write_text
-from jaxcal.io.frame_names import FramePair, two_names
+from jaxcal.io.frame_names import FramePair, check_frames, two_names
 from jaxcal.io.given_files import check_readable, naming, one_line, path_name, read_bytes
 from jaxcal.io.outputs import check_output
 from jaxcal.model.unknowns import TABLE, tangent_names
@@ -211,6 +211,7 @@ def _record(transform: ImageTransform) -> dict[str, Any]:
         transform.covariance,
         transform.image_covariance,
     )
+    probe = transform.probe_frame
     return {
         "format": FORMAT,
         "version": VERSION,
@@ -224,6 +225,7 @@ def _record(transform: ImageTransform) -> dict[str, Any]:
         "image_unknowns": tangent_names(transform.unknowns),
         "image_covariance": None if full is None else full.tolist(),
         "rms_mm": transform.error_mm,
+        "pose_frames": None if probe == "Probe" else {"from": probe, "to": None},
         "date": transform.date,
         "jaxcal_version": __version__,
     }
@@ -364,7 +366,7 @@ def transform_from_record(record: dict[str, Any], *, source: str = "memory") -> 
     offset = _array(record, "face_offset_mm", ())
     factor = _array(record, "range_factor", ())
     error = _array(record, "rms_mm", ())
-    date = record.get("date")
+    date, named = record.get("date"), record.get("pose_frames")
     if not (date is None or isinstance(date, str)):
         raise FormatError("date must be text")
     usable = usable and not record.get("wrong_frames")
@@ -382,7 +384,16 @@ def transform_from_record(record: dict[str, Any], *, source: str = "memory") -> 
         unknowns,
         _array(record, "image_covariance", (size, size)),
         date,
+        probe_frame(named.get("from") if isinstance(named, dict) else None),
     )
+
+
+def probe_frame(named: object) -> str:
+    """A name of the probe's frame as it is used; Probe if it is none, or one that PLUS refuses."""
+    try:
+        return check_frames(("Image", named))[1] if isinstance(named, str) else "Probe"
+    except InputError:
+        return "Probe"
 
 
 def _unknowns(record: dict[str, Any]) -> tuple[str, ...]:

@@ -75,6 +75,7 @@ class ImageTransform:
         converged: whether the calibration can be used; None if unknown.
         source: the file, for messages.
         date: when the calibration was made, ISO 8601 with its time zone; None if unknown.
+        probe_frame: name of the probe's frame, for programs that name frames.
 
     Raises:
         InputError: wrong shapes, ``unknowns`` or ``date``; and, unless ``converged`` is False, NaN
@@ -93,6 +94,7 @@ class ImageTransform:
     unknowns: tuple[str, ...] = ("translation", "rotation")
     image_covariance: Float[np.ndarray, "q q"] | None = None
     date: str | None = None
+    probe_frame: str = "Probe"
 
     def __post_init__(self) -> None:
         moving = [name for name in TABLE if TABLE[name].in_image]
@@ -320,7 +322,7 @@ class ImageTransform:
         path: str | os.PathLike[str],
         format: SaveFormat | None = None,
         *,
-        frames: FramePair = ("Image", "Probe"),
+        frames: FramePair | None = None,
     ) -> None:
         """Write the calibration, complete or not at all.
 
@@ -330,7 +332,8 @@ class ImageTransform:
                 (``.tfm``, ``.txt`` or ``.h5``), ``ros`` (YAML, metres), ``tusrec``
                 (``calib_matrix.csv``) or ``numpy`` (``.npy``: PLUS's matrix; ``.npz``: all). By
                 default that of the extension.
-            frames: names of the image's and the probe's frame.
+            frames: names of the image's and the probe's frame; by default Image and
+                ``probe_frame``.
 
         Raises:
             InputError: an extension of another or no format, an existing file of another kind, an
@@ -340,9 +343,9 @@ class ImageTransform:
         """
         from jaxcal.result import saved
 
-        saved.save(self, path, format, frames=frames)
+        saved.save(self, path, format, frames=self._frames(frames))
 
-    def text(self, format: SaveFormat, *, frames: FramePair = ("Image", "Probe")) -> str:
+    def text(self, format: SaveFormat, *, frames: FramePair | None = None) -> str:
         """The text that :meth:`save` writes in a format; for ``numpy`` it is PLUS's matrix.
 
         Raises:
@@ -351,7 +354,10 @@ class ImageTransform:
         """
         from jaxcal.result import saved
 
-        return saved.text_of(self, format, frames=frames)
+        return saved.text_of(self, format, frames=self._frames(frames))
+
+    def _frames(self, frames: FramePair | None) -> FramePair:
+        return ("Image", self.probe_frame) if frames is None else frames
 
     def left_out(self, format: SaveFormat) -> str | None:
         """What a format cannot hold and its user must do, in words; None if it holds everything."""
