@@ -524,6 +524,35 @@ def test_a_stated_unit_is_not_advised_against(tmp_path):
         import_files([tmp_path / "m.csv", tmp_path / "p.csv"], ImportOptions(pose_units="mm"))
 
 
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("x.mat", "save its numbers as a table"),
+        ("x.XLSX", "save its numbers as a table"),
+        ("x.npy", "save its numbers as a table"),
+        ("results.xml", "jaxcal export, apply and compare read"),
+        ("frame.png", "name the folder"),
+    ],
+)
+def test_what_to_do_with_other_files_is_told(tmp_path, name, told):
+    """MATLAB's and Excel's files were to be saved as UTF-8."""
+    (tmp_path / name).write_bytes(b"MATLAB 5.0 MAT-file\xff\0")
+    with pytest.raises(FormatError, match=rf"{name}: is not a recording .* \({told}"):
+        import_files([tmp_path / name])
+
+
+@pytest.mark.parametrize("clock", ["26-Nov-2026 08:15:00.250", "26.11.2026 08:15:00"])
+def test_which_dates_are_read_is_told(tmp_path, clock):
+    """MATLAB and Excel write others."""
+    lines = [f"{clock},{line}" for line in table(NAMES, COLUMNS)]
+    lines[0] = lines[0].replace(clock, "time")
+    (tmp_path / "t.csv").write_text("\n".join(lines))
+    with pytest.raises(FormatError, match=r"t\.csv:2: column 1 \('time'\) is neither .* ISO 8601"):
+        import_files([tmp_path / "t.csv"])
+    notes = import_files([tmp_path / "t.csv"], ImportOptions(ignore_time=True)).notes
+    assert "not kept" in notes[0]
+
+
 POINTS_OF_SIX = "\n".join(table(["u", "v"], [PIXELS]))
 
 

@@ -410,6 +410,11 @@ def _times(
         return None, None
     dates = [_date(table.rows[row][column]) for row in rows]
     if dates[0] is None:
+        if ":" in table.rows[rows[0]][column]:
+            raise FormatError(
+                f"{table.row(rows[0])}: {table.column(column)} is neither seconds nor a date by "
+                f"ISO 8601 (2026-11-26T08:15:00): {quoted(table.rows[rows[0]][column])}"
+            )
         time = table.numbers((column,), rows)[:, 0] * (columns.time_s or 1.0)
         late = np.flatnonzero(np.abs(time) > _LATEST_S)
         if len(late):
