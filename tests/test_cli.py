@@ -453,6 +453,7 @@ def test_pixels_without_a_spacing_are_refused(capfd, recording, tmp_path):
     line = refused(capfd, "calibrate", tmp_path / "pixels.h5", "--out", tmp_path / "report")
     assert "pixels.h5: the pixels have no spacing_mm" in line
     assert "--estimate scale" in line
+    assert "jaxcal import --spacing" in line
     assert not (tmp_path / "report").exists()
 
 
