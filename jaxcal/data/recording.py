@@ -139,6 +139,8 @@ class Recording:
             raise InputError(f"truth must be that of a simulation, not {shown(self.truth)}")
         if self.probe is not None:
             check_probe(self.probe)
+        if self.pose_frames is not None:
+            object.__setattr__(self, "pose_frames", _checked_names(self.pose_frames))
 
     def __len__(self) -> int:
         return len(self.calibration)
@@ -149,6 +151,15 @@ class Recording:
         truth = "" if self.truth is None else ", with truth"
         probe = "" if self.probe is None else f", probe={self.probe}"
         return f"Recording({self.source!r}, {self.calibration}{test}{truth}{probe})"
+
+
+def _checked_names(frames: Any) -> tuple[str, str]:
+    """The names of two frames, which may be those of a file that is not trusted."""
+    if isinstance(frames, (tuple, list)) and len(frames) == 2:
+        source, target = frames
+        if all(isinstance(name, str) and name.strip() and name.isprintable() for name in frames):
+            return source, target
+    raise InputError(f"pose_frames must be the names of two frames, not {shown(frames)}")
 
 
 def joined(first: Recording, second: Recording) -> Recording:

@@ -181,11 +181,7 @@ def _read_frames(root: Node) -> tuple[str, str] | None:
     images = group(root, "calibration")
     found = [None if images is None else text(images, name) for name in _POSE_FRAMES]
     source, target = found
-    if source is None or target is None:
-        return None
-    if not (source.isprintable() and target.isprintable()):
-        raise FormatError(f"{images}: {' and '.join(_POSE_FRAMES)} must be names of frames")
-    return source, target
+    return None if source is None or target is None else (source, target)
 
 
 def _check_header(root: Node) -> None:
