@@ -19,7 +19,6 @@ from jaxcal.data.recording import joined
 from jaxcal.io.columns import columns_of_header
 from jaxcal.io.import_options import ImportOptions
 from jaxcal.io.importing import import_files
-from jaxcal.io.plus import read_transform
 from jaxcal.io.sequence_files import read_sequence, write_sequence
 from jaxcal.io.slicer import read_markups
 from jaxcal.io.trackers import read_tracker
@@ -791,7 +790,11 @@ def test_import_calibrate_export(tmp_path, capsys):
     (tmp_path / "cal.json").write_text(capsys.readouterr().out)
     found = jaxcal.load_calibration(tmp_path / "cal.json")
     slicer = jaxcal.load_calibration(tmp_path / "x.tfm").plus_matrix()
-    for matrix in (read_transform(config, "Image", "UsProbe").matrix, slicer):
+    assert jaxcal.load_calibration(config).probe_frame == "UsProbe"
+    assert main(["export", str(tmp_path / "cal.json"), str(tmp_path / "t.xml"), "--plus"]) == 0
+    assert main(["export", str(config), str(tmp_path / "t.xml"), "--plus"]) == 0
+    alone = jaxcal.load_calibration(tmp_path / "t.xml").plus_matrix()
+    for matrix in (jaxcal.load_calibration(config).plus_matrix(), alone, slicer):
         np.testing.assert_allclose(matrix, found.plus_matrix(), rtol=0, atol=1e-11)
     assert config.read_text().count("<Transform ") == 1
     for arguments, frame in (([], "UsProbe"), (["--probe-frame", "Wand"], "Wand")):

@@ -254,7 +254,8 @@ def load_calibration(path: str | os.PathLike[str]) -> ImageTransform:
             from jaxcal.io.plus import read_transform
 
             found = read_transform(path)
-            return transform_from_plus_matrix(found.matrix, error_mm=found.error_mm, source=name)
+            made = transform_from_plus_matrix(found.matrix, error_mm=found.error_mm, source=name)
+            return replace(made, probe_frame=probe_frame(found.target))
         if lower.endswith((".tfm", ".txt", ".h5")):
             from jaxcal.io.itk import read_itk
 
