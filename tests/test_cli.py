@@ -36,7 +36,7 @@ from jaxcal.study.simulation import Protocol
 
 FIGURES = ("residuals", "offsets", "accuracy", "influence", "limits")
 REPORT = {
-    "calibration.json", "verdict.txt", "residuals.csv",
+    "calibration.json", "verdict.txt", "residuals.csv", "test_residuals.csv",
     *(f"{name}.{kind}" for name in FIGURES for kind in ("png", "svg")),
 }  # fmt: skip
 DETERMINED = {name for name in REPORT if name.split(".")[0] in ("accuracy", "influence", "limits")}
@@ -73,6 +73,8 @@ SCHEMA = {
     "warnings": list,
     "source": str,
     "convention": dict,
+    "test_residual_mm": list,
+    "date": str,
     "jaxcal_version": str,
 }
 
@@ -451,6 +453,7 @@ def test_pixels_without_a_spacing_are_refused(capfd, recording, tmp_path):
     line = refused(capfd, "calibrate", tmp_path / "pixels.h5", "--out", tmp_path / "report")
     assert "pixels.h5: the pixels have no spacing_mm" in line
     assert "--estimate scale" in line
+    assert "jaxcal import --spacing" in line
     assert not (tmp_path / "report").exists()
 
 

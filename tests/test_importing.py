@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from scipy.spatial.transform import Rotation
 import jaxcal
 from jaxcal import FormatError, InputError
 from jaxcal.cli.main import main
+from jaxcal.data.recording import joined
 from jaxcal.io.columns import columns_of_header
 from jaxcal.io.import_options import ImportOptions
 from jaxcal.io.importing import import_files
@@ -393,8 +395,17 @@ def test_points_of_a_sequence(tmp_path, sequence, name, text, points):
     assert "poses from Probe to Reference" in notes[0]
     assert "1 of 6 frames left out: their tracking was not OK" in notes
     tracker = ImportOptions(points=points, target="Tracker")
-    found = import_files([sequence, tmp_path / name], tracker)[0].calibration.poses
-    np.testing.assert_allclose(found, (random_poses(6, 9) @ POSES)[KEPT], atol=1e-11)
+    found = import_files([sequence, tmp_path / name], tracker)[0]
+    np.testing.assert_allclose(
+        found.calibration.poses, (random_poses(6, 9) @ POSES)[KEPT], atol=1e-11
+    )
+    assert recording.pose_frames == ("Probe", "Reference")
+    jaxcal.save(found, tmp_path / "r.h5")
+    kept = jaxcal.load(tmp_path / "r.h5")
+    assert kept.pose_frames == ("Probe", "Tracker")
+    assert joined(kept, kept).pose_frames == kept.pose_frames
+    with pytest.raises(InputError, match="from Probe to Reference, not from Probe to Tracker"):
+        joined(kept, recording)
 
 
 @pytest.mark.parametrize(
@@ -510,6 +521,35 @@ def test_a_stated_unit_is_not_advised_against(tmp_path):
     (tmp_path / "p.csv").write_text("u,v\n1,1\n1,1\n")
     with pytest.raises(FormatError, match="its Length Units are meters, not mm"):
         import_files([tmp_path / "m.csv", tmp_path / "p.csv"], ImportOptions(pose_units="mm"))
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("x.mat", "save its numbers as a table"),
+        ("x.XLSX", "save its numbers as a table"),
+        ("x.npy", "save its numbers as a table"),
+        ("results.xml", "jaxcal export, apply and compare read"),
+        ("frame.png", "name the folder"),
+    ],
+)
+def test_what_to_do_with_other_files_is_told(tmp_path, name, told):
+    """MATLAB's and Excel's files were to be saved as UTF-8."""
+    (tmp_path / name).write_bytes(b"MATLAB 5.0 MAT-file\xff\0")
+    with pytest.raises(FormatError, match=rf"{name}: is not a recording .* \({told}"):
+        import_files([tmp_path / name])
+
+
+@pytest.mark.parametrize("clock", ["26-Nov-2026 08:15:00.250", "26.11.2026 08:15:00"])
+def test_which_dates_are_read_is_told(tmp_path, clock):
+    """MATLAB and Excel write others."""
+    lines = [f"{clock},{line}" for line in table(NAMES, COLUMNS)]
+    lines[0] = lines[0].replace(clock, "time")
+    (tmp_path / "t.csv").write_text("\n".join(lines))
+    with pytest.raises(FormatError, match=r"t\.csv:2: column 1 \('time'\) is neither .* ISO 8601"):
+        import_files([tmp_path / "t.csv"])
+    notes = import_files([tmp_path / "t.csv"], ImportOptions(ignore_time=True)).notes
+    assert "not kept" in notes[0]
 
 
 POINTS_OF_SIX = "\n".join(table(["u", "v"], [PIXELS]))
@@ -731,7 +771,8 @@ def test_import_calibrate_export(tmp_path, capsys):
     """The documented path, and its answer against the truth."""
     truth = burnt_sequence(tmp_path / "x.igs.mha")
     config = tmp_path / "config.xml"
-    lines = ["<PlusConfiguration>", " <CoordinateDefinitions>", " </CoordinateDefinitions>"]
+    old = ' <Transform From="Image" To="UsProbe" Matrix="1 0 0 0  0 1 0 0  0 0 1 0  0 0 0 1" />'
+    lines = ["<PlusConfiguration>", "<CoordinateDefinitions>", old, "</CoordinateDefinitions>"]
     config.write_bytes("\r\n".join([*lines, "</PlusConfiguration>", ""]).encode())
     recording = str(tmp_path / "out.h5")
     region = [str(value) for value in (COLUMN, ROW, WIDE, HIGH)]
@@ -740,16 +781,29 @@ def test_import_calibrate_export(tmp_path, capsys):
     # Frames in which a real reflection is as bright as the target are left out and counted.
     assert 24 <= int(re.search(r"out\.h5: (\d+) images, pixels", said)[1]) <= 27
     assert "1 of 28 frames left out: their tracking was not OK" in said
+    # The probe's marker has another name in this laboratory, in the recording as in PLUS.
+    named = replace(jaxcal.load(recording), pose_frames=("UsProbe", "Tracker"))
+    jaxcal.save(named, recording)
     arguments = ["--method", "conventional", "--estimate", "scale", "--json"]
     exported = ["--export", f"plus:{config}", "--export", f"slicer:{tmp_path / 'x.tfm'}"]
     assert main(["calibrate", recording, *arguments, *exported]) == 0
     (tmp_path / "cal.json").write_text(capsys.readouterr().out)
     found = jaxcal.load_calibration(tmp_path / "cal.json")
-    for other in (config, tmp_path / "x.tfm"):
-        matrix = jaxcal.load_calibration(other).plus_matrix()
+    slicer = jaxcal.load_calibration(tmp_path / "x.tfm").plus_matrix()
+    assert jaxcal.load_calibration(config).probe_frame == "UsProbe"
+    assert main(["export", str(tmp_path / "cal.json"), str(tmp_path / "t.xml"), "--plus"]) == 0
+    assert main(["export", str(config), str(tmp_path / "t.xml"), "--plus"]) == 0
+    alone = jaxcal.load_calibration(tmp_path / "t.xml").plus_matrix()
+    for matrix in (jaxcal.load_calibration(config).plus_matrix(), alone, slicer):
         np.testing.assert_allclose(matrix, found.plus_matrix(), rtol=0, atol=1e-11)
+    assert config.read_text().count("<Transform ") == 1
+    for arguments, frame in (([], "UsProbe"), (["--probe-frame", "Wand"], "Wand")):
+        assert main(["export", str(tmp_path / "cal.json"), "--plus", *arguments]) == 0
+        assert f'From="Image" To="{frame}"' in capsys.readouterr().out
+    found.save(tmp_path / "again.json")
+    assert jaxcal.load_calibration(tmp_path / "again.json").probe_frame == "UsProbe"
     record = json.loads((tmp_path / "cal.json").read_text())
-    assert record["exported"][0] == f"{config}: Image to Probe written"
+    assert record["exported"][0] == f"{config}: Image to UsProbe written"
     assert record["exported"][-1] == f"{tmp_path / 'x.tfm'}: written"
     np.testing.assert_allclose(record["plus_image_to_probe"], found.plus_matrix(), atol=1e-12)
     # The error of X in its own frame, X Exp(d), against the stated covariance.
@@ -805,9 +859,9 @@ def test_images_are_added_to_a_recording(tmp_path, capsys):
     assert main(["import", more, out]) == 2
     assert main(["import", more, out, "--add-to", first]) == 0
     assert "- 2 images added to the 4 of " in capsys.readouterr().out
-    joined, whole = jaxcal.load(out).calibration, jaxcal.load(tmp_path / "all.h5").calibration
-    np.testing.assert_allclose(joined.poses, whole.poses, atol=1e-12)
-    np.testing.assert_array_equal(joined.measurements, whole.measurements)
+    both, whole = jaxcal.load(out).calibration, jaxcal.load(tmp_path / "all.h5").calibration
+    np.testing.assert_allclose(both.poses, whole.poses, atol=1e-12)
+    np.testing.assert_array_equal(both.measurements, whole.measurements)
     assert main(["import", second, out, "--add-to", first]) == 0
     assert len(jaxcal.load(out)) == 8
 

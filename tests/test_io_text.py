@@ -79,6 +79,17 @@ def test_real_crosswire_recording():
     np.testing.assert_allclose(gram, np.tile(np.eye(3), (54, 1, 1)), atol=1e-12)
 
 
+def test_whole_matrices_are_poses_too(pair):
+    """MATLAB's users stack 4x4 matrices; no row of a rotation is zero."""
+    rows = pair[0].read_text().splitlines()
+    whole = [line for k in range(0, 18, 3) for line in (*rows[k : k + 3], "0 0 0 1")]
+    pair[0].write_text("\n".join(whole))
+    np.testing.assert_allclose(read_crosswire(*pair[:2]).calibration.poses, pair[2], atol=1e-12)
+    pair[0].write_text("\n".join([*whole[:-1], "0 0 0 2"]))
+    with pytest.raises(FormatError, match="8 poses but 6 points"):
+        read_crosswire(*pair[:2])
+
+
 def test_crosswire_rows_that_are_not_whole_poses(pair):
     lines = pair[0].read_text().splitlines()
     pair[0].write_text("# comment\n\n" + "\n".join(lines[:-1]))
@@ -181,7 +192,7 @@ def test_a_header_that_numpy_made_a_comment(tmp_path, delimiter):
     path.write_text(path.read_text().replace("# x", "x"))
     read_csv(path)
     np.savetxt(path, rows, delimiter=delimiter, header="of the probe")
-    with pytest.raises(FormatError, match=r"9 columns without a header; .* are needed$"):
+    with pytest.raises(FormatError, match=r"9 columns without a header; .* are needed, or a first"):
         read_csv(path)
 
 

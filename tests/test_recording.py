@@ -1,9 +1,11 @@
 """What a recording refuses, beyond what the readers' own tests hold."""
 
 import copy
+import dataclasses
 import subprocess
 import sys
 
+import h5py
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -100,3 +102,18 @@ def test_numbers_beyond_any_measure_are_refused_with_their_row(name: str):
         jaxcal.make_images(**given)
     # An image left out may hold anything.
     jaxcal.make_images(**given, mask=np.arange(6) != 3)
+
+
+@pytest.mark.parametrize("name", ["", " ", "\x1b[31mProbe", "Pro\nbe"])
+def test_frames_have_names(tmp_path, name):
+    """They are printed, and those of a file are not trusted."""
+    recording = jaxcal.simulate_recording(jaxcal.Protocol(images=6, test_images=4))
+    with pytest.raises(InputError, match="must be the names of two frames"):
+        dataclasses.replace(recording, pose_frames=("Probe", name))
+    path = tmp_path / "rec.h5"
+    jaxcal.save(dataclasses.replace(recording, pose_frames=("Probe", "Tracker")), path)
+    with h5py.File(path, "r+") as file:
+        file["calibration"].attrs["pose_to"] = name
+    with pytest.raises(InputError, match=r"rec\.h5: pose_frames must be the names") as caught:
+        jaxcal.load(path)
+    assert str(caught.value).isprintable()

@@ -20,7 +20,7 @@ from jaxcal.report.next_poses import next_poses_record, next_poses_sentences
 from jaxcal.report.paragraphs import laid_out, listed
 from jaxcal.report.plots import convergence_figure, plot_offsets, plot_residuals
 from jaxcal.report.record import calibration_record, check_test_images, plain, truth_error
-from jaxcal.report.tables import calibration_table, comparison_table
+from jaxcal.report.tables import calibration_table, comparison_table, frames_and_target
 from jaxcal.report.verdict import frames_of_images, verdict
 from jaxcal.report.write import COLUMNS, prepare_folder, write_report
 from jaxcal.result.calibration import Status
@@ -144,6 +144,38 @@ def pixels(images, spacing, face_offset, *, known=True):
         spacing_mm=np.array(spacing) if known else None,
         face_offset_mm=face_offset,
     )
+
+
+def test_residuals_of_test_images_make_up_the_precision(tmp_path, result, recording, record):
+    """Along the axes of each image, from its point to the mean of all."""
+    used = np.arange(20) != 4
+    frame = 10 + np.arange(20)
+    test = dataclasses.replace(recording.test, mask=used, frame=frame)
+    named = dataclasses.replace(recording, test=test, pose_frames=("Wand", "Reference"))
+    found = calibration_record(result, named)
+    assert found["test_residual_mm"][4] is None
+    residuals = np.array([row for row in found["test_residual_mm"] if row is not None])
+    precision = np.sqrt((residuals**2).sum() / (len(residuals) - 1))
+    assert precision == pytest.approx(found["reconstruction_precision_mm"], rel=1e-9)
+    transform = np.asarray(result.image_to_probe)
+    points = np.c_[test.measurements[:, 0], np.zeros(20), test.measurements[:, 1], np.ones(20)]
+    to_image = np.linalg.inv(test.poses @ transform)
+    cloud = np.einsum("nij,jk,nk->ni", test.poses, transform, points)
+    target = to_image @ cloud[used].mean(axis=0)
+    np.testing.assert_allclose(residuals, (target - points)[used, :3], atol=1e-9)
+    write_report(tmp_path, found, result, named, [])
+    with (tmp_path / "test_residuals.csv").open() as table:
+        rows = list(csv.DictReader(table))
+    assert float(rows[19]["distance_mm"]) == pytest.approx(np.linalg.norm(residuals[-1]))
+    assert [rows[4][name] for name in ("used", "axial_mm", "frame")] == ["0", "", "14"]
+    # The frames and the target's SD, too, are those of the record.
+    assert found["pose_frames"] == {"from": "Wand", "to": "Reference"}
+    facts = dict(frames_and_target(found))
+    assert facts["poses"] == "from Wand to Reference"
+    assert set(facts) == {"poses", "target in Reference frame (mm)", "SD of the target (mm)"}
+    sd = np.sqrt(np.asarray(result.point_covariance).diagonal())
+    assert facts["SD of the target (mm)"] == ", ".join(f"{each:.3f}" for each in sd)
+    assert "target in tracker frame (mm)" in dict(frames_and_target(record))
 
 
 def test_pixel_test_images_are_brought_to_mm(result, recording, record):
@@ -296,6 +328,23 @@ def test_no_poses_are_named_where_a_delay_was_estimated(result, recording):
     assert next_poses_record(result, recording) is not None
     delayed = dataclasses.replace(result, blocks=(*result.blocks, "delay"))
     assert next_poses_record(delayed, recording) is None
+
+
+def test_advised_tilts_can_be_limited(result, recording):
+    """A hand-held probe cannot be tilted as far as every pose of a recording."""
+
+    def tilts(cone_deg):
+        poses = next_poses_record(result, recording, cone_deg)["poses"]
+        images = np.array([pose["pose"] for pose in poses])[:, :3, :3] @ transform
+        return np.degrees(np.arccos(images[:, :, 2] @ middle[:, 2]))
+
+    transform = np.asarray(result.image_to_probe)[:3, :3]
+    images = recording.calibration
+    seen = images.poses[images.mask][:, :3, :3] @ transform
+    u, _, v = np.linalg.svd(seen.mean(axis=0))
+    middle = u @ v
+    assert tilts(5.0).max() < 5.001
+    assert tilts(None).max() > 15
 
 
 def test_verdict_names_outliers_and_out_of_plane_errors(record):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import json
 import re
 import signal
@@ -15,6 +16,7 @@ import h5py
 import numpy as np
 import pytest
 
+import jaxcal
 from jaxcal import FormatError, InputError
 from jaxcal.cli.main import main
 from jaxcal.data.poses import check_affine, quaternion_from_rotation, rotations_from_quaternions
@@ -439,6 +441,26 @@ def test_older_json(tmp_path):
     np.testing.assert_allclose(found.plus_matrix(), known.plus_matrix(), atol=1e-12)
 
 
+def test_date_and_version_are_saved(tmp_path):
+    """A file says when its calibration was made, also after it was read and written again."""
+    made, again = tmp_path / "made.json", tmp_path / "again.json"
+    before = datetime.datetime.now(datetime.UTC).replace(microsecond=0)
+    random_transform().save(made)
+    record = json.loads(made.read_text())
+    date = datetime.datetime.fromisoformat(record["date"])
+    assert before <= date <= datetime.datetime.now(datetime.UTC)
+    assert record["jaxcal_version"] == jaxcal.__version__
+    made.write_text(json.dumps(record | {"date": "2020-02-03T04:05:06Z"}))
+    load_calibration(made).save(again)
+    assert json.loads(again.read_text())["date"] == "2020-02-03T04:05:06Z"
+    # PLUS has local times, without a zone.
+    local = datetime.datetime(2020, 2, 3, 4, 5, 6, tzinfo=datetime.UTC).astimezone()
+    config = tmp_path / "config.xml"
+    config.write_text("<PlusConfiguration><CoordinateDefinitions /></PlusConfiguration>")
+    assert main(["export", str(again), "--plus-config", str(config)]) == 0
+    assert f'Date="{local:%Y.%m.%d %H:%M:%S}"' in config.read_text()
+
+
 def good_record():
     return json.loads(random_transform().text("json"))
 
@@ -448,6 +470,8 @@ def good_record():
     [
         ({"format": "other"}, "its format is 'other'"),
         ({"version": 2}, "understands version 1: update jaxcal"),
+        ({"date": "2020-02-03T04:05:06"}, "date must be ISO 8601 with a time zone"),
+        ({"date": [1]}, "date must be text"),
         ({"version": "x"}, "is version 'x'"),
         (
             {"image_plane_to_probe": None},
@@ -583,12 +607,13 @@ import numpy as np
 from jaxcal import ImageTransform, InputError
 known = ImageTransform(np.eye(4), scale_mm_per_px=np.ones(2))
 for form in ("plus", "ros"):
-    for frames in ("Image", ("Image",), None, ("Image", 3), ("A", "B", "C")):
+    for frames in ("Image", ("Image",), (), ("Image", 3), ("A", "B", "C")):
         try:
             print(form, frames, known.text(form, frames=frames))
         except InputError as error:
             assert str(error).startswith("frames must be two names"), error
     assert known.text(form, frames=["Image", "Probe"]) == known.text(form)
+    assert known.text(form, frames=None) == known.text(form)
 """
 
 

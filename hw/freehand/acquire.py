@@ -106,6 +106,8 @@ class _Run:
         """Run until enough images are taken, or the person ends it."""
         asked, guide = self._asked, self._guide
         self._note("started", f"{asked.images - len(guide.taken)} images to take")
+        source, target = self._posed.pair
+        self._recorder.attributes("calibration", {"pose_from": source, "pose_to": target})
         if asked.spacing_mm is not None:
             self._recorder.attributes("calibration", {"spacing_mm": list(asked.spacing_mm)})
         while len(guide.taken) < asked.images:

@@ -491,8 +491,8 @@ def _check_unknowns(problem: Problem, request: Request) -> None:
         )
     if problem.pixels and not problem.spacing_known and "scale" not in request.estimate:
         raise InputError(
-            'the pixels have no spacing_mm: give it, or estimate the scale (estimate=("scale",), '
-            "--estimate scale)"
+            "the pixels have no spacing_mm: give it (jaxcal import --spacing), or estimate the "
+            'scale (estimate=("scale",), --estimate scale)'
         )
 
 

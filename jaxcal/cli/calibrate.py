@@ -155,6 +155,13 @@ EXPORTS: tuple[SaveFormat, ...] = ("plus", "slicer", "itk", "ros", "tusrec", "nu
     "the recording has them), with its interval.",
 )
 @click.option(
+    "--cone",
+    type=click.FloatRange(0, 85),
+    metavar="DEG",
+    help="Largest tilt of the poses that are advised, from the middle orientation of the images "
+    "(that of the images by default, at least 30), for a probe that cannot be tilted further.",
+)
+@click.option(
     "--require",
     type=click.Choice(WORDS),
     default=REQUIRED,
@@ -183,6 +190,7 @@ def calibrate(
     bootstrap: int | None,
     exports: tuple[str, ...],
     tre_points: tuple[tuple[float, float], ...],
+    cone: float | None,
     require: str,
     report: str | None,
     out: str | None,
@@ -225,12 +233,14 @@ def calibrate(
     from jaxcal.report.next_poses import next_poses_record
     from jaxcal.report.record import calibration_record, check_test_images
     from jaxcal.report.write import prepare_folder, write_report
+    from jaxcal.result.saved import dated
     from jaxcal.runtime.jax_cache import enable_compilation_cache
 
     measured, notes = segmented(load(recording))
     test_data = None if test is None else segmented(load(test))[0]
     check_test_images(measured, test_data)
     _check_pixels(measured, targets)
+    _check_configurations(measured, targets, inputs)
     enable_compilation_cache()
     with nullcontext() if out is None else prepare_folder(out) as folder:
         if report is not None:
@@ -244,11 +254,12 @@ def calibrate(
                 result = _solve(measured, request, traced=traced)
             record = calibration_record(result, measured, test_data, tre_points)
             record["warnings"] += notes
-            record["next_poses"] = next_poses_record(result, measured)
+            record["next_poses"] = next_poses_record(result, measured, cone)
         if cross_validate or bootstrap is not None:
             with progress("calibrating over and over"), naming(recording):
                 record |= _resampled(measured, request, result, cross_validate, bootstrap)
             settle(record)
+        record = dated(record)
         if folder is not None:
             with progress("drawing the report"):
                 curves = _curves(measured, request, result)
@@ -267,7 +278,6 @@ def calibrate(
 
 
 def _export_target(text: str, inputs: list[str], out: str | None) -> tuple[SaveFormat, str]:
-    from jaxcal.cli.export import check_configuration
     from jaxcal.io.atomic import check_writable
     from jaxcal.result.saved import check_target
 
@@ -280,8 +290,6 @@ def _export_target(text: str, inputs: list[str], out: str | None) -> tuple[SaveF
         check_target(path, format, inputs)
     elif not Path(path).is_file():
         raise InputError(f"--export {text}: there is no such configuration")
-    else:
-        check_configuration(path, None, inputs)
     # The report's folder may not be there yet.
     if out is None or Path(path).parent != Path(out):
         check_writable(path)
@@ -318,6 +326,19 @@ def _check_pixels(recording: Recording, targets: list[tuple[SaveFormat, str]]) -
             )
 
 
+def _check_configurations(
+    recording: Recording, targets: list[tuple[SaveFormat, str]], inputs: list[str]
+) -> None:
+    """Refuse configurations of PLUS that cannot take the transform to the recording's probe."""
+    from jaxcal.cli.export import check_configuration
+    from jaxcal.result.saved import probe_frame
+
+    frames = "Image", probe_frame((recording.pose_frames or (None,))[0])
+    for format, path in targets:
+        if format == "plus":
+            check_configuration(path, None, inputs, frames)
+
+
 def _export(
     record: dict[str, Any], recording: str, targets: list[tuple[SaveFormat, str]]
 ) -> list[str]:
@@ -333,7 +354,7 @@ def _export(
     said: list[str] = []
     for format, path in targets:
         if format == "plus":
-            said += patched(transform, path, None, ("Image", "Probe"))
+            said += patched(transform, path, None, ("Image", transform.probe_frame))
         else:
             said += written(transform, path, format)
     return said

@@ -103,7 +103,9 @@ def _table(*headings: str) -> Table:
 
     table = Table(box=box.SIMPLE)
     for heading in headings:
-        table.add_column(heading, justify="right" if "(" in heading else "left")
+        # Folded: where a path is cut off, those of one folder look alike.
+        justify = "right" if "(" in heading else "left"
+        table.add_column(heading, justify=justify, overflow="fold")
     return table
 
 

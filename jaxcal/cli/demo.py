@@ -46,6 +46,7 @@ def demo(out: str | None, seed: int, as_json: bool) -> int:
     from jaxcal.io.outputs import check_output, is_simulated
     from jaxcal.report.record import calibration_record
     from jaxcal.report.write import prepare_folder
+    from jaxcal.result.saved import dated
     from jaxcal.runtime.jax_cache import enable_compilation_cache
     from jaxcal.study.simulation import Protocol, simulate_recording
 
@@ -59,7 +60,7 @@ def demo(out: str | None, seed: int, as_json: bool) -> int:
         with progress(f"compiling and solving ({', '.join(_METHODS)})"):
             results, milliseconds = _solve(recording)
         records: dict[Method, dict[str, Any]] = {
-            name: calibration_record(result, recording) for name, result in results.items()
+            name: dated(calibration_record(result, recording)) for name, result in results.items()
         }
         if folder is not None:
             with progress("drawing the report"):

@@ -61,7 +61,9 @@ def _one_format(_: click.Context, __: click.Parameter, given: tuple[str, ...]) -
     help="Set the transform in a PlusServer that is running (port 18944 by default).",
 )
 @click.option("--image-frame", default="Image", show_default=True, metavar="FRAME")
-@click.option("--probe-frame", default="Probe", show_default=True, metavar="FRAME")
+@click.option(
+    "--probe-frame", metavar="FRAME", help="[default: the recording's name of it, or Probe]"
+)
 @click.option(
     "--pixel-size",
     type=POSITIVE,
@@ -83,7 +85,7 @@ def export(
     plus_config: str | None,
     plus_server: tuple[str, int] | None,
     image_frame: str,
-    probe_frame: str,
+    probe_frame: str | None,
     pixel_size: tuple[float, float] | None,
     origin: tuple[float, float] | None,
 ) -> int:
@@ -101,21 +103,21 @@ def export(
         raise click.UsageError("--plus-server writes no file: leave OUT out")
     if origin is not None and pixel_size is None:
         raise click.BadParameter("needs --pixel-size", param_hint="--origin")
-    if (image_frame, probe_frame) != ("Image", "Probe") and format in _NAMELESS:
+    if (image_frame, probe_frame or "Probe") != ("Image", "Probe") and format in _NAMELESS:
         raise click.UsageError(
             f"--{format} names no frames: leave --image-frame, --probe-frame out"
         )
     from jaxcal.result.saved import check_target, load_calibration
 
-    if plus_config is not None:
-        check_configuration(plus_config, out, [calibration], (image_frame, probe_frame))
-    elif out is not None:
+    if plus_config is None and out is not None:
         format = check_target(out, format, [calibration])
     transform = load_calibration(calibration)
     transform.check_usable()
+    frames = image_frame, probe_frame or transform.probe_frame
+    if plus_config is not None:
+        check_configuration(plus_config, out, [calibration], frames)
     if pixel_size is not None:
         transform = transform.with_pixels(pixel_size, origin or (0.0, 0.0))
-    frames = image_frame, probe_frame
     if plus_config is not None:
         for line in patched(transform, plus_config, out, frames):
             click.echo(line)
@@ -133,7 +135,7 @@ def check_configuration(
     path: str,
     out: str | None,
     inputs: Sequence[str],
-    frames: tuple[str, str] = ("Image", "Probe"),
+    frames: tuple[str, str],
 ) -> None:
     """Check that a transform can be put into a configuration of PLUS, in place or in a copy.
 
@@ -162,7 +164,7 @@ def written(
     transform: ImageTransform,
     path: str,
     format: SaveFormat | None,
-    frames: tuple[str, str] = ("Image", "Probe"),
+    frames: tuple[str, str] | None = None,
 ) -> list[str]:
     """Write a transform; what was done and what should be known."""
     transform.save(path, format, frames=frames)
@@ -182,10 +184,17 @@ def patched(
         transform.plus_matrix(),
         out=out,
         error_mm=transform.error_mm,
-        date=datetime.datetime.now(),
+        date=_made(transform),
     )
     written = f"{config if out is None else out}: {frames[0]} to {frames[1]} written"
     return [written, *(f"- {note}" for note in notes)]
+
+
+def _made(transform: ImageTransform) -> datetime.datetime:
+    """When the calibration was made, in local time; the present where that is not known."""
+    if transform.date is None:
+        return datetime.datetime.now()
+    return datetime.datetime.fromisoformat(transform.date).astimezone()
 
 
 def sent(transform: ImageTransform, server: tuple[str, int], frames: tuple[str, str]) -> str:

@@ -125,7 +125,8 @@ def check_poses(
             )
         raise InputError(
             f"{name(row)} is not a rotation: its 3x3 block is {distance[row]:.3g} away from "
-            f"the nearest one (at most {ROTATION_TOLERANCE:g} is taken for rounding)"
+            f"the nearest one (at most {ROTATION_TOLERANCE:g} is taken for rounding; the numbers "
+            "of a matrix are needed row by row)"
         )
     full[:, :3, :3] = rotations
     full[:, 3] = _LAST_ROW

@@ -116,6 +116,8 @@ class Recording:
         test: the images of an independent test set, or None.
         truth: the true values of a simulation, or None.
         probe: the transducer, or None.
+        pose_frames: names of the poses' two frames, that of the probe and that of the tracker, if
+            the file that the images came from states them.
         source: the file that it came from, for messages.
     """
 
@@ -124,6 +126,7 @@ class Recording:
     truth: Truth | None = None
     probe: Probe | None = None
     source: str = field(default="memory", compare=False)
+    pose_frames: tuple[str, str] | None = None
 
     def __post_init__(self) -> None:
         for name, images in (("calibration", self.calibration), ("test", self.test)):
@@ -136,6 +139,8 @@ class Recording:
             raise InputError(f"truth must be that of a simulation, not {shown(self.truth)}")
         if self.probe is not None:
             check_probe(self.probe)
+        if self.pose_frames is not None:
+            object.__setattr__(self, "pose_frames", _checked_names(self.pose_frames))
 
     def __len__(self) -> int:
         return len(self.calibration)
@@ -148,6 +153,15 @@ class Recording:
         return f"Recording({self.source!r}, {self.calibration}{test}{truth}{probe})"
 
 
+def _checked_names(frames: Any) -> tuple[str, str]:
+    """The names of two frames, which may be those of a file that is not trusted."""
+    if isinstance(frames, (tuple, list)) and len(frames) == 2:
+        source, target = frames
+        if all(isinstance(name, str) and name.strip() and name.isprintable() for name in frames):
+            return source, target
+    raise InputError(f"pose_frames must be the names of two frames, not {shown(frames)}")
+
+
 def joined(first: Recording, second: Recording) -> Recording:
     """The calibration images of two recordings of one target, in this order, as one recording.
 
@@ -155,7 +169,7 @@ def joined(first: Recording, second: Recording) -> Recording:
     truth of a simulation. Test images are those of the first.
 
     Raises:
-        InputError: the images differ in kind, size of a pixel or probe.
+        InputError: the images differ in kind, size of a pixel, probe or frames of the poses.
     """
     a, b = first.calibration, second.calibration
     where = f"{second.source} cannot be added to {first.source}"
@@ -169,6 +183,10 @@ def joined(first: Recording, second: Recording) -> Recording:
         )
     if None not in (first.probe, second.probe) and first.probe != second.probe:
         raise InputError(f"{where}: their probes differ")
+    frames = [each.pose_frames for each in (first, second)]
+    if None not in frames and frames[0] != frames[1]:
+        told = ", not ".join("from {} to {}".format(*pair) for pair in reversed(frames))  # pyright: ignore[reportOptionalIterable]
+        raise InputError(f"{where}: its poses lead {told} (import with --from and --to)")
 
     def both(name: str) -> Any:
         values = getattr(a, name), getattr(b, name)
@@ -182,6 +200,7 @@ def joined(first: Recording, second: Recording) -> Recording:
         truth=None,
         probe=first.probe or second.probe,
         source=f"{first.source} with {second.source}",
+        pose_frames=first.pose_frames or second.pose_frames,
     )
 
 

@@ -85,8 +85,8 @@ def opened(
 
 def tracked_poses(
     sequence: TrackedSequence, options: ImportOptions
-) -> tuple[Float[np.ndarray, "n 4 4"], Bool[np.ndarray, " n"], list[str]]:
-    """Poses of a sequence, where they can be used, and what was assumed and left out.
+) -> tuple[Float[np.ndarray, "n 4 4"], Bool[np.ndarray, " n"], FramePair, list[str]]:
+    """Poses of a sequence, where they can be used, their frames, and what was assumed and left out.
 
     Raises:
         InputError: no way between the frames, or no frame with tracking.
@@ -102,7 +102,7 @@ def tracked_poses(
         notes.append(f"{lost} of {len(sequence)} frames left out: their tracking was not OK")
     if not valid.any():
         raise InputError(f"{sequence.source}: no frame has tracking from {start} to {end}")
-    return poses, valid, notes
+    return poses, valid, (start, end), notes
 
 
 def tool_poses(
@@ -121,7 +121,7 @@ def tool_poses(
         sequence = read_tracked(source, options.pose_units)
         if options.source is None and "Stylus" in sequence.frames():
             options = replace(options, source="Stylus")
-        poses, valid, notes = tracked_poses(sequence, options)
+        poses, valid, _, notes = tracked_poses(sequence, options)
         return poses[valid], notes
     if kind != "table":
         raise InputError(f"{os.fspath(source)}: holds no poses of a tool")
@@ -153,7 +153,7 @@ def frames_to_show(
         raise InputError(f"{sequence.source}: holds no pixels, only transforms")
     usable, notes = sequence.image_valid, []
     if sequence.transforms:
-        _, valid, notes = tracked_poses(sequence, options)
+        _, valid, _, notes = tracked_poses(sequence, options)
         usable = usable & valid
     if not usable.any():
         raise InputError(f"{sequence.source}: no frame can be used")

@@ -10,7 +10,8 @@
                  optional covariance (n, 2, 2) [mm^2, px^2 for pixels], amplitude (n,),
                  mask (n,) bool, time (n,) [s], max_elevation (n,) [mm],
                  frame (n,): numbers of the frames in the file that the images came from;
-                 pixel has attrs spacing_mm [lateral, axial] and face_offset_mm, both optional
+                 pixel has attrs spacing_mm [lateral, axial] and face_offset_mm, both optional;
+                 optional attrs pose_from, pose_to: names of the poses' frames
     /test        optional, as /calibration
     /truth       optional; image_to_probe (4, 4), point (3,), elevation (n,) [mm]
     /segmentation  where the points came from, for other programs; not read (see _write_fate,
@@ -84,6 +85,7 @@ _SPELLINGS = {
 _FREE = "1"
 _PER_IMAGE = {"amplitude": _FREE, "time": "s", "max_elevation": "mm", "frame": _FREE}
 """Optional numbers, one an image, and their units."""
+_POSE_FRAMES = ("pose_from", "pose_to")
 
 
 def load(path: str | os.PathLike[str]) -> Recording:
@@ -170,7 +172,16 @@ def _read_root(root: Node, name: str) -> Recording:
         truth=_read_truth(root, len(selected)),
         probe=probe,
         source=name,
+        pose_frames=_read_frames(root),
     )
+
+
+def _read_frames(root: Node) -> tuple[str, str] | None:
+    """The names of the calibration poses' frames."""
+    images = group(root, "calibration")
+    found = [None if images is None else text(images, name) for name in _POSE_FRAMES]
+    source, target = found
+    return None if source is None or target is None else (source, target)
 
 
 def _check_header(root: Node) -> None:
@@ -341,7 +352,10 @@ def _write(file: h5py.File, recording: Recording) -> None:
             probe.attrs["radius_mm"] = recording.probe.radius_mm
         if recording.probe.delay_s:
             probe.attrs["delay_s"] = recording.probe.delay_s
-    _write_images(file.create_group("calibration"), recording.calibration)
+    calibration = file.create_group("calibration")
+    _write_images(calibration, recording.calibration)
+    if recording.pose_frames is not None:
+        calibration.attrs.update(zip(_POSE_FRAMES, recording.pose_frames, strict=True))
     if recording.test is not None:
         _write_images(file.create_group("test"), recording.test)
     if recording.truth is not None:

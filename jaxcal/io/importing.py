@@ -150,7 +150,7 @@ def _from_sequence(
             notes.append(note)
         sequence, said = with_poses_by_time(sequence, tracking, lag_s)
         notes += said
-    poses, valid, said = tracked_poses(sequence, options)
+    poses, valid, frames, said = tracked_poses(sequence, options)
     notes += said
     spacing = _spacing(sequence, options)
     with _naming_pose_units(options, sequence.length_stated):
@@ -183,7 +183,10 @@ def _from_sequence(
             where=where,
         )
     notes += used.notes + said
-    return Imported(Recording(images, source=sequence.source), notes, results)
+    # A table of poses does not name their frames.
+    named = options.poses is None or kind_of(options.poses) != "table"
+    recording = Recording(images, source=sequence.source, pose_frames=frames if named else None)
+    return Imported(recording, notes, results)
 
 
 def _estimated_lag(

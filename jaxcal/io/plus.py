@@ -38,25 +38,29 @@ class PlusTransform(NamedTuple):
 
     ``error_mm`` is what an fCal result states for the calibration as a whole (mean of the lowest
     95 % of its errors), and what a configuration states beside the transform; None without.
+    ``target`` is the frame to which it leads.
     """
 
     matrix: Float[np.ndarray, "4 4"]
     error_mm: float | None
+    target: str
 
 
 def read_transform(
-    path: str | os.PathLike[str], source: str = "Image", target: str = "Probe"
+    path: str | os.PathLike[str], source: str = "Image", target: str | None = None
 ) -> PlusTransform:
     """Read the transform between two frames; the file is not trusted.
 
-    It is a configuration, an fCal result, or a Transform element alone.
+    It is a configuration, an fCal result, or a Transform element alone. If no target is named, it
+    is ``Probe``, or the only frame of another name to which a transform leads from the source
+    (the transducer's own frames do not count).
 
     Raises:
         FormatError: not such a file, a DTD, a transform that is not 16 finite numbers, no such
             transform, or one that is marked as not valid; one line with path and line.
     """
     root, _ = read_xml(path)
-    wanted = capitalised(source), capitalised(target)
+    wanted = capitalised(source), capitalised(target or "Probe")
     with naming(path):
         of_result = root.tag == "ProbeCalibrationResult"
         if of_result:
@@ -68,14 +72,22 @@ def read_transform(
             elements = [each for place in root.all(_COORDINATES) for each in _transforms(place)]
         # All are looked at: a file with a damaged transform is not to be trusted.
         stated = [(_matrix(e), _frames(e), _optional_number(e, "Error"), e) for e in elements]
+        ends = {to for _, (start, to), *_ in stated if start == wanted[0] and not _inner(to)}
+        if target is None and len(ends) == 1:
+            wanted = wanted[0], *ends
         for matrix, frames, error_mm, element in stated:
             if frames == wanted:
                 _check_status(element)
                 if of_result:
                     errors = root.first("ErrorReport/ReprojectionError3DStatistics")
                     error_mm = _optional_number(errors, "CalibrationMeanMm")
-                return PlusTransform(matrix, error_mm)
-        raise FormatError(f"holds no transform from {source} to {target}")
+                return PlusTransform(matrix, error_mm, frames[1])
+        raise FormatError(f"holds no transform from {' to '.join(wanted)}")
+
+
+def _inner(frame: str) -> bool:
+    """Whether a frame is one of the transducer's, in the image (TransducerOriginPixel)."""
+    return frame.startswith("TransducerOrigin")
 
 
 def _check_root(root: Element) -> None:

@@ -17,6 +17,18 @@ from jaxcal.io.trackers import is_tracker_export, read_tracker
 SEQUENCES = ("sequence", "tracker", "scan", "folder")
 
 
+_AS_TABLE = " (save its numbers as a table, CSV)"
+_NOT_IMPORTED = {
+    ".xml": " (jaxcal export, apply and compare read PLUS's calibration in it)",
+    ".png": " (name the folder of the PNG images)",
+    ".dcm": " (--spacing-from reads its pixel size)",
+    ".vtk": "",
+    ".mrb": "",
+    **dict.fromkeys((".mat", ".npy", ".npz", ".xls", ".xlsx", ".ods"), _AS_TABLE),
+}
+"""Endings of other files, and what to do with these."""
+
+
 def kind_of(source: str | os.PathLike[str]) -> str:
     """One of :data:`SEQUENCES`, ``markups`` or ``table``.
 
@@ -32,11 +44,9 @@ def kind_of(source: str | os.PathLike[str]) -> str:
         return "markups"
     if name.endswith((".h5", ".hdf5")):
         return "scan"
-    if name.endswith((".xml", ".png", ".dcm", ".vtk", ".seq.mrb", ".mrb")):
-        raise FormatError(
-            f"{os.fspath(source)}: is not a recording that can be imported (PNG images: name their "
-            "folder)"
-        )
+    for ending, hint in _NOT_IMPORTED.items():
+        if name.endswith(ending):
+            raise FormatError(f"{os.fspath(source)}: is not a recording that can be imported{hint}")
     return "tracker" if is_tracker_export(source) else "table"
 
 

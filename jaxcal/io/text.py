@@ -189,7 +189,7 @@ def read_crosswire(
 
     Args:
         transforms_path: 3 rows ``R_i0 R_i1 R_i2 t_i`` for each image, i = 0, 1, 2: probe ->
-            tracker; separated by white space. The row 0 0 0 1 is left out.
+            tracker; separated by white space. The row 0 0 0 1 may follow in all images.
         points_path: a row ``u v`` for each image: lateral and axial, px.
         spacing_mm: [lateral, axial] mm per px, when known.
         pose_units: of translations in the file.
@@ -209,6 +209,9 @@ def read_crosswire(
     rows = _fixed(
         transforms, (4,), "3 rotation numbers and a translation, separated by white space"
     )
+    if len(rows) % 4 == 0 and (rows[3::4] == [0, 0, 0, 1]).all():
+        # Whole matrices: no row of a rotation is zero.
+        rows = rows.reshape(-1, 4, 4)[:, :3].reshape(-1, 4)
     if len(rows) % 3:
         raise FormatError(
             f"{transforms.row(-1)}: {len(rows)} rows are not whole poses: each takes 3 rows"
@@ -293,7 +296,9 @@ def _columns(table: Table, quaternion: QuaternionOrder | None) -> Columns:
         matrix = tuple(range(1, width - 2))
         return Columns(width, matrix=matrix, time=0, point=(width - 2, width - 1))
     if width != 10:
-        hint = " (name two columns of points by a first line u,v)" if width == 2 else ""
+        hint = ", or a first line that names the columns"
+        if width == 2:
+            hint = " (name two columns of points by a first line u,v)"
         if has_commented_header(table):
             hint = " (remove the # before the header)"
         raise FormatError(
@@ -405,6 +410,11 @@ def _times(
         return None, None
     dates = [_date(table.rows[row][column]) for row in rows]
     if dates[0] is None:
+        if ":" in table.rows[rows[0]][column]:
+            raise FormatError(
+                f"{table.row(rows[0])}: {table.column(column)} is neither seconds nor a date by "
+                f"ISO 8601 (2026-11-26T08:15:00): {quoted(table.rows[rows[0]][column])}"
+            )
         time = table.numbers((column,), rows)[:, 0] * (columns.time_s or 1.0)
         late = np.flatnonzero(np.abs(time) > _LATEST_S)
         if len(late):

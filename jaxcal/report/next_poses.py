@@ -18,8 +18,15 @@ NOT_PLANNED = "delay"
 so that both have a large SD, and an image point a small one."""
 
 
-def next_poses_record(result: Calibration, recording: Recording) -> dict[str, Any] | None:
+def next_poses_record(
+    result: Calibration, recording: Recording, cone_deg: float | None = None
+) -> dict[str, Any] | None:
     """The three images that would help most; None where nothing can be said.
+
+    Args:
+        result: of the recording.
+        recording: what was calibrated.
+        cone_deg: largest tilt; by default that of the images, at least 30 degrees.
 
     Returns:
         ``tre_now_mm`` and ``tre_then_mm`` (predicted, root mean square over the image),
@@ -32,7 +39,9 @@ def next_poses_record(result: Calibration, recording: Recording) -> dict[str, An
     if NOT_PLANNED in result.blocks:
         return None
     try:
-        candidates = design.candidates_around(recording, result, count=_CANDIDATES)
+        candidates = design.candidates_around(
+            recording, result, count=_CANDIDATES, cone_deg=cone_deg
+        )
         plan = design.next_poses(result, candidates, COUNT)
     except InputError:
         return None

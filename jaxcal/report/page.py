@@ -30,6 +30,7 @@ from jaxcal.report.certified import certificate_words
 from jaxcal.report.next_poses import next_poses_sentences
 from jaxcal.report.paragraphs import BULLET, listed
 from jaxcal.report.resampled import resampled_sentences
+from jaxcal.report.tables import frames_and_target
 from jaxcal.report.verdict import (
     advice,
     believe,
@@ -596,6 +597,8 @@ def _facts(record: dict[str, Any]) -> str:
         ("images", f"{record['images_used']} used of {record['images']}"),
         ("data", record["data"]),
         ("jaxcal", record["jaxcal_version"]),
+        *([("date (UTC)", record["date"])] if "date" in record else []),
+        *frames_and_target(record),
     ]
     scale = record["scale_mm_per_px"]
     if scale is not None:

@@ -13,7 +13,7 @@ from jaxcal.data.poses import rotation_angle
 from jaxcal.data.recording import Images, Recording, Truth
 from jaxcal.diagnostics.intervals import beside_scale
 from jaxcal.diagnostics.law_words import offset_law
-from jaxcal.diagnostics.metrics import reconstruction_precision
+from jaxcal.diagnostics.metrics import reconstruct, reconstruction_precision
 from jaxcal.diagnostics.misfits import noise_model
 from jaxcal.diagnostics.outliers import outlier_reasons, outliers, suspects
 from jaxcal.model.unknowns import (
@@ -39,6 +39,8 @@ CONVENTION = {
     "(tracked) frame. It is not PLUS's ImageToProbe",
     "plus_image_to_probe": "4x4, row-major; PLUS's and Slicer's ImageToProbe: maps (u, v, 0, 1) in "
     "pixels to the probe's frame; null for points in mm",
+    "pose_frames": "names of the two frames of the poses, which are called the probe's (from) and "
+    "the tracker's (to) here; null where the recording does not state them",
     "point_mm": "target in the tracker's frame",
     "elevation_mm": "estimated distance of the target from the image's mid-plane, along y; 0 where "
     "an image was left out",
@@ -62,6 +64,10 @@ CONVENTION = {
     "Eq. 7's minimum is at most gap_mm2 lower; null where no proof is tried",
     "wrong_frames": "what is wrong with the data's frames or units, in words: the calibration is "
     "not to be used; null where nothing seems wrong",
+    "test_residual_mm": "of every test image, from its point to the mean of all: lateral, "
+    "elevational, axial; null where it is not used",
+    "date": "when the calibration was written: ISO 8601, UTC; not in the record of a calibration "
+    "in memory",
     "offset_law": "which law the elevational offsets follow and with what probability, their mean, "
     "and which noise model is in use; null where no laws were weighed",
 }
@@ -100,6 +106,7 @@ def calibration_record(
     transform = answer.image_transform()
     full, rows = answer.unknowns_covariance, in_image(answer.blocks)
     known = bool(np.isfinite(full).all())
+    frames = recording.pose_frames
     record: dict[str, Any] = {
         "format": FORMAT,
         "version": VERSION,
@@ -112,6 +119,7 @@ def calibration_record(
         "images": len(answer.mask),
         "images_used": int(result.images_used),
         "frame": recording.calibration.frame,
+        "pose_frames": frames and {"from": frames[0], "to": frames[1]},
         "image_plane_to_probe": answer.image_to_probe,
         "plus_image_to_probe": None if scale is None else transform.plus_matrix(),
         "point_mm": answer.point,
@@ -132,6 +140,8 @@ def calibration_record(
         "reconstruction_precision_mm": _precision(answer, images),
         "reconstruction_precision_set": "calibration" if tested is None else "test",
         "reconstruction_precision_images": int(np.sum(images.mask)),
+        "test_residual_mm": None if tested is None else _test_residual(answer, tested),
+        "test_frame": None if tested is None else tested.frame,
         "scale_mm_per_px": answer.scale_mm_per_px,
         "face_offset_mm": transform.face_offset_mm,
         "range_factor": transform.range_factor,
@@ -258,6 +268,22 @@ def _precision(result: Calibration, images: Images) -> float | None:
         images.mask.astype(float),
     )
     return float(value)
+
+
+def _test_residual(result: Calibration, images: Images) -> list[np.ndarray | None] | None:
+    """Of every test image: from its point to the mean of all, along the image's axes, mm.
+
+    The root of the sum of their squares over n - 1 is the reconstruction precision. None for an
+    image that is not used, and for all if there is no calibration.
+    """
+    transform, used = np.asarray(result.image_to_probe), images.mask
+    if not (used.any() and np.isfinite(transform).all()):
+        return None
+    cloud = reconstruct(transform, images.poses, _points_mm(images, result))
+    missed = cloud[used].mean(axis=0) - cloud
+    axes = images.poses[:, :3, :3] @ transform[:3, :3]
+    along = np.einsum("nji,nj->ni", axes, missed)
+    return [row if kept else None for row, kept in zip(along, used, strict=True)]
 
 
 def _points_mm(images: Images, result: Calibration) -> Float[np.ndarray, "n 2"]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from rich import box
@@ -70,7 +71,7 @@ def _facts(record: dict[str, Any]) -> list[tuple[str, str]]:
         ("method", f"{record['method']}{prior}"),
         ("status", f"{record['status']} after {record['iterations']} iterations"),
         ("images", f"{record['images_used']} used of {record['images']}"),
-        ("target in tracker frame (mm)", _numbers(record["point_mm"], ".3f")),
+        *frames_and_target(record),
         (
             "error SD (mm)",
             f"lateral {_number(record['sigma_lateral_mm'], '.3f')}, "
@@ -135,6 +136,20 @@ def _facts(record: dict[str, Any]) -> list[tuple[str, str]]:
                 f"target {_number(error['point_mm'], '.3f')} mm",
             )
         )
+    return facts
+
+
+def frames_and_target(record: dict[str, Any]) -> list[tuple[str, str]]:
+    """The frames of the poses, where they have names, and the target in the second one."""
+    frames, covariance = record["pose_frames"], record["point_covariance_mm2"]
+    facts = [] if frames is None else [("poses", f"from {frames['from']} to {frames['to']}")]
+    where = "tracker" if frames is None else frames["to"]
+    facts.append((f"target in {where} frame (mm)", _numbers(record["point_mm"], ".3f")))
+    if covariance is not None:
+        # A variance that is not known is null, one that is zero may be rounded to below.
+        variances = [covariance[axis][axis] for axis in range(3)]
+        sd = [None if each is None else math.sqrt(max(each, 0.0)) for each in variances]
+        facts.append(("SD of the target (mm)", _numbers(sd, ".3f")))
     return facts
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import math
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -22,6 +23,17 @@ from jaxcal.report.verdict import verdict
 from jaxcal.result.calibration import Calibration
 from jaxcal.result.saved import is_calibration_record
 from jaxcal.runtime.array_types import Int
+
+TEST_COLUMNS = (
+    "image",
+    "used",
+    "lateral_mm",
+    "elevational_mm",
+    "axial_mm",
+    "distance_mm",
+    "frame",
+)
+"""Columns of test_residuals.csv: from the point of each test image to the mean of all of them."""
 
 COLUMNS = (
     "image",
@@ -42,6 +54,7 @@ NAMES = (
     "calibration.json",
     "verdict.txt",
     "residuals.csv",
+    "test_residuals.csv",
     "comparison.json",
     *(f"{name}.{kind}" for name in FIGURES for kind in ("png", "svg")),
 )
@@ -92,9 +105,9 @@ def write_report(
     comparison.json.
 
     Returns:
-        The files: calibration.json, verdict.txt, residuals.csv, and each figure as .png and .svg:
-        residuals and offsets; accuracy, influence and limits, if the answer may be used; and
-        convergence.
+        The files: calibration.json, verdict.txt, residuals.csv, test_residuals.csv if there
+        are test images, and each figure as .png and .svg: residuals and offsets; accuracy,
+        influence and limits, if the answer may be used; and convergence.
 
     Raises:
         OutputError: the report could not be written; an earlier one is unchanged.
@@ -120,6 +133,8 @@ def write_report(
         "verdict.txt": "\n".join(verdict(record)) + "\n",
         "residuals.csv": _residual_table(result, recording.calibration.frame),
     }
+    if record["test_residual_mm"] is not None:
+        texts["test_residuals.csv"] = _test_table(record)
     if comparison is not None:
         texts["comparison.json"] = _json(comparison)
     # File names that are not UTF-8 are lone surrogates in the texts.
@@ -157,6 +172,18 @@ def _residual_table(result: Calibration, frame: Int[np.ndarray, " n"] | None) ->
         cells = [_cell(value) if used else "" for value in numbers]
         number = "" if frame is None else int(frame[image])
         rows.writerow([image, int(used), *cells, int(answer.at_bound[image] > 0), number])
+    return table.getvalue()
+
+
+def _test_table(record: dict[str, Any]) -> str:
+    frame = record["test_frame"]
+    table = io.StringIO()
+    rows = csv.writer(table, lineterminator="\n")
+    rows.writerow(TEST_COLUMNS)
+    for image, residual in enumerate(record["test_residual_mm"]):
+        cells = [""] * 4 if residual is None else [*residual, math.hypot(*residual)]
+        number = "" if frame is None else frame[image]
+        rows.writerow([image, int(residual is not None), *cells, number])
     return table.getvalue()
 
 

@@ -15,7 +15,7 @@ from jaxcal.data.probe import Probe
 from jaxcal.data.problem import Problem
 from jaxcal.model.distributions import OffsetLaw
 from jaxcal.model.unknowns import TABLE, Blocks, in_image
-from jaxcal.result.saved import check_target
+from jaxcal.result.saved import check_target, dated
 from jaxcal.result.transform import AppliedPoints, ImageTransform, SaveFormat
 from jaxcal.runtime.array_types import AnyArray, Bool, Float, Int
 from jaxcal.runtime.arrays import array_module, array_tree, is_traced, map_arrays, static
@@ -471,7 +471,7 @@ class Calibration:
         if check_target(path, format) == "json":
             from jaxcal.report.write import write_json
 
-            write_json(path, self.record())
+            write_json(path, dated(self.record()))
         else:
             self.image_transform().save(path, format)
 
@@ -485,7 +485,7 @@ class Calibration:
         from jaxcal.report.page import write_page
         from jaxcal.report.summary import recording_of
 
-        write_page(path, self.record(), self, recording_of(self))
+        write_page(path, dated(self.record()), self, recording_of(self))
 
     def plot_tre(self) -> Figure:
         """Map of the error to expect over the image (matplotlib)."""

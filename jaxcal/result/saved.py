@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import datetime
 import json
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 from zipfile import ZipFile
 
 import numpy as np
 
-from jaxcal import FormatError, InputError
+from jaxcal import FormatError, InputError, __version__
 from jaxcal.io.atomic import atomic_path, write_text
-from jaxcal.io.frame_names import FramePair, two_names
+from jaxcal.io.frame_names import FramePair, check_frames, two_names
 from jaxcal.io.given_files import check_readable, naming, one_line, path_name, read_bytes
 from jaxcal.io.outputs import check_output
 from jaxcal.model.unknowns import TABLE, tangent_names
@@ -138,7 +140,8 @@ def save(
             else:
                 np.save(file, transform.plus_matrix())
     else:
-        write_text(path, text_of(transform, chosen, frames=frames))
+        dated = replace(transform, date=transform.date or utc_now())
+        write_text(path, text_of(dated, chosen, frames=frames))
 
 
 def text_of(transform: ImageTransform, format: SaveFormat, *, frames: FramePair) -> str:
@@ -179,6 +182,20 @@ def text_of(transform: ImageTransform, format: SaveFormat, *, frames: FramePair)
     raise InputError(f"{quoted(str(format))} is not a format that can be written")
 
 
+def utc_now() -> str:
+    """The present date and time in UTC, ISO 8601, to the second."""
+    now = datetime.datetime.now(datetime.UTC)
+    return now.isoformat(timespec="seconds").replace("+00:00", "Z")
+
+
+def dated(record: dict[str, Any]) -> dict[str, Any]:
+    """A calibration's record with the present date and time, for a file or a page.
+
+    Without them, equal calibrations have equal records.
+    """
+    return record | {"date": utc_now()}
+
+
 def left_out(transform: ImageTransform, format: SaveFormat) -> str | None:
     """What a format cannot hold and its user must do, in words; None where nothing is."""
     if format != "ros":
@@ -194,6 +211,7 @@ def _record(transform: ImageTransform) -> dict[str, Any]:
         transform.covariance,
         transform.image_covariance,
     )
+    probe = transform.probe_frame
     return {
         "format": FORMAT,
         "version": VERSION,
@@ -207,6 +225,9 @@ def _record(transform: ImageTransform) -> dict[str, Any]:
         "image_unknowns": tangent_names(transform.unknowns),
         "image_covariance": None if full is None else full.tolist(),
         "rms_mm": transform.error_mm,
+        "pose_frames": None if probe == "Probe" else {"from": probe, "to": None},
+        "date": transform.date,
+        "jaxcal_version": __version__,
     }
 
 
@@ -233,7 +254,8 @@ def load_calibration(path: str | os.PathLike[str]) -> ImageTransform:
             from jaxcal.io.plus import read_transform
 
             found = read_transform(path)
-            return transform_from_plus_matrix(found.matrix, error_mm=found.error_mm, source=name)
+            made = transform_from_plus_matrix(found.matrix, error_mm=found.error_mm, source=name)
+            return replace(made, probe_frame=probe_frame(found.target))
         if lower.endswith((".tfm", ".txt", ".h5")):
             from jaxcal.io.itk import read_itk
 
@@ -345,6 +367,9 @@ def transform_from_record(record: dict[str, Any], *, source: str = "memory") -> 
     offset = _array(record, "face_offset_mm", ())
     factor = _array(record, "range_factor", ())
     error = _array(record, "rms_mm", ())
+    date, named = record.get("date"), record.get("pose_frames")
+    if not (date is None or isinstance(date, str)):
+        raise FormatError("date must be text")
     usable = usable and not record.get("wrong_frames")
     unknowns = _unknowns(record)
     size = len(tangent_names(unknowns))
@@ -359,7 +384,17 @@ def transform_from_record(record: dict[str, Any], *, source: str = "memory") -> 
         1.0 if factor is None else float(factor),
         unknowns,
         _array(record, "image_covariance", (size, size)),
+        date,
+        probe_frame(named.get("from") if isinstance(named, dict) else None),
     )
+
+
+def probe_frame(named: object) -> str:
+    """A name of the probe's frame as it is used; Probe if it is none, or one that PLUS refuses."""
+    try:
+        return check_frames(("Image", named))[1] if isinstance(named, str) else "Probe"
+    except InputError:
+        return "Probe"
 
 
 def _unknowns(record: dict[str, Any]) -> tuple[str, ...]:

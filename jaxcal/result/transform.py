@@ -15,6 +15,7 @@ z = x cross y.
 
 from __future__ import annotations
 
+import datetime
 import math
 import os
 from dataclasses import dataclass, replace
@@ -31,6 +32,7 @@ from jaxcal.model.image_points import point_jacobian
 from jaxcal.model.unknowns import TABLE, tangent_names
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.given_values import check_flag, real_array
+from jaxcal.runtime.messages import shown
 
 SaveFormat = Literal["json", "plus", "slicer", "itk", "ros", "tusrec", "numpy"]
 
@@ -72,11 +74,13 @@ class ImageTransform:
         error_mm: root mean square residual of the calibration, mm; None if unknown.
         converged: whether the calibration can be used; None if unknown.
         source: the file, for messages.
+        date: when the calibration was made, ISO 8601 with its time zone; None if unknown.
+        probe_frame: name of the probe's frame, for programs that name frames.
 
     Raises:
-        InputError: wrong shapes or ``unknowns``; and, unless ``converged`` is False, NaN or Inf, a
-            matrix that is not rigid, sizes or a factor that are not positive, a covariance that is
-            not symmetric or has negative variances.
+        InputError: wrong shapes, ``unknowns`` or ``date``; and, unless ``converged`` is False, NaN
+            or Inf, a matrix that is not rigid, sizes or a factor that are not positive, a
+            covariance that is not symmetric or has negative variances.
     """
 
     image_plane_to_probe: Float[np.ndarray, "4 4"]
@@ -89,6 +93,8 @@ class ImageTransform:
     range_factor: float = 1.0
     unknowns: tuple[str, ...] = ("translation", "rotation")
     image_covariance: Float[np.ndarray, "q q"] | None = None
+    date: str | None = None
+    probe_frame: str = "Probe"
 
     def __post_init__(self) -> None:
         moving = [name for name in TABLE if TABLE[name].in_image]
@@ -107,6 +113,8 @@ class ImageTransform:
         }
         if self.converged is not None:
             check_flag("converged", self.converged)
+        if self.date is not None:
+            _check_date(self.date)
         given = {name: getattr(self, name) for name in shapes}
         if given["image_plane_to_probe"] is None:
             raise InputError("image_plane_to_probe must be an array of real numbers")
@@ -314,7 +322,7 @@ class ImageTransform:
         path: str | os.PathLike[str],
         format: SaveFormat | None = None,
         *,
-        frames: FramePair = ("Image", "Probe"),
+        frames: FramePair | None = None,
     ) -> None:
         """Write the calibration, complete or not at all.
 
@@ -324,7 +332,8 @@ class ImageTransform:
                 (``.tfm``, ``.txt`` or ``.h5``), ``ros`` (YAML, metres), ``tusrec``
                 (``calib_matrix.csv``) or ``numpy`` (``.npy``: PLUS's matrix; ``.npz``: all). By
                 default that of the extension.
-            frames: names of the image's and the probe's frame.
+            frames: names of the image's and the probe's frame; by default Image and
+                ``probe_frame``.
 
         Raises:
             InputError: an extension of another or no format, an existing file of another kind, an
@@ -334,9 +343,9 @@ class ImageTransform:
         """
         from jaxcal.result import saved
 
-        saved.save(self, path, format, frames=frames)
+        saved.save(self, path, format, frames=self._frames(frames))
 
-    def text(self, format: SaveFormat, *, frames: FramePair = ("Image", "Probe")) -> str:
+    def text(self, format: SaveFormat, *, frames: FramePair | None = None) -> str:
         """The text that :meth:`save` writes in a format; for ``numpy`` it is PLUS's matrix.
 
         Raises:
@@ -345,7 +354,10 @@ class ImageTransform:
         """
         from jaxcal.result import saved
 
-        return saved.text_of(self, format, frames=frames)
+        return saved.text_of(self, format, frames=self._frames(frames))
+
+    def _frames(self, frames: FramePair | None) -> FramePair:
+        return ("Image", self.probe_frame) if frames is None else frames
 
     def left_out(self, format: SaveFormat) -> str | None:
         """What a format cannot hold and its user must do, in words; None if it holds everything."""
@@ -376,6 +388,16 @@ def _checked(values: dict[str, np.ndarray]) -> Float[np.ndarray, "4 4"]:
     rigid = check_poses(matrix[None], what="the matrix", labels=["image_plane_to_probe"])[0]
     # What was rigid keeps every digit.
     return matrix if np.abs(rigid - matrix).max() < _ROUNDING else rigid
+
+
+def _check_date(value: object) -> None:
+    """Refuse what is no date with a time zone."""
+    try:
+        if isinstance(value, str) and datetime.datetime.fromisoformat(value).tzinfo is not None:
+            return
+    except ValueError:
+        pass
+    raise InputError(f"date must be ISO 8601 with a time zone, not {shown(value)}")
 
 
 def _is_symmetric(covariance: Float[np.ndarray, "q q"]) -> bool:

@@ -159,6 +159,7 @@ def test_images_and_transforms_apart(tmp_path, separate):
     check(tmp_path / "r.h5", [0, 1, 2, 3])
     images = jaxcal.load(tmp_path / "r.h5").calibration
     np.testing.assert_array_equal(images.spacing_mm, SPACING_MM)
+    assert jaxcal.load(tmp_path / "r.h5").pose_frames == ("Probe", "Reference")
 
 
 def test_what_is_not_taken_is_said(tmp_path, plus_server):
