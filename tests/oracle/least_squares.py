@@ -180,14 +180,20 @@ def _explicit(
     blocks: tuple[str, ...],
 ) -> tuple[np.ndarray, np.ndarray]:
     """Residuals and their Jacobian by the shared unknowns and the free offsets."""
-    count, rows = size(blocks), np.flatnonzero(free)
+    rows = np.flatnonzero(free)
 
     def moved(step: np.ndarray) -> np.ndarray:
-        offset = y.astype(step.dtype)
-        offset[rows] += step[count:]
-        return residual(u.moved(step[:count], blocks), offset).ravel()
+        return residual(u.moved(step, blocks), y).ravel()
 
-    return moved(np.zeros(count + len(rows))), jacobian(moved, count + len(rows))
+    def offset(step: np.ndarray) -> np.ndarray:
+        other = y.astype(step.dtype)
+        other[rows] += step
+        return residual(u, other).ravel()
+
+    along = jacobian(moved, size(blocks))
+    if len(rows):
+        along = np.concatenate([along, jacobian(offset, len(rows))], axis=1)
+    return residual(u, y).ravel(), along
 
 
 def _newton(
@@ -277,7 +283,10 @@ def bounded(data: Data, blocks: tuple[str, ...], bound: np.ndarray, start: Unkno
             return circle(data, here.moved(v[:count], blocks), v[count:]).ravel()
 
         def along(v: np.ndarray, here: Unknowns = here) -> np.ndarray:
-            return jacobian(lambda step: residual(v + step, here), len(v))
+            u, y = here.moved(v[:count], blocks), v[count:]
+            shared = jacobian(lambda step: residual(np.append(v[:count] + step, y), here), count)
+            own = jacobian(lambda step: circle(data, u, y + step), len(y))
+            return np.concatenate([shared, own], axis=1)
 
         found = least_squares(
             residual,

@@ -14,6 +14,7 @@ import numpy as np
 
 SIZE = {"translation": 3, "rotation": 3, "point": 3, "scale": 2, "sound-speed": 1, "delay": 1}
 RIGID = ("translation", "rotation", "point")
+NOTHING = np.zeros(3)
 TINY = 1e-30
 """The complex step: its square is nothing beside one, so derivatives are exact to rounding."""
 
@@ -72,16 +73,14 @@ class Unknowns:
             part[name] = step[at : at + SIZE[name]]
             at += SIZE[name]
 
-        def of(name: str) -> np.ndarray:
-            return part.get(name, np.zeros(SIZE[name]))
-
+        # A block that is not among them stays.
         return Unknowns(
-            self.rotation @ turn(of("rotation")),
-            self.translation + self.rotation @ of("translation"),
-            self.point + of("point"),
-            self.scale * np.exp(of("scale")),
-            self.speed * np.exp(of("sound-speed")[0]),
-            self.delay + of("delay")[0],
+            self.rotation @ turn(part["rotation"]) if "rotation" in part else self.rotation,
+            self.translation + self.rotation @ part.get("translation", NOTHING),
+            self.point + part.get("point", NOTHING),
+            self.scale * np.exp(part["scale"]) if "scale" in part else self.scale,
+            self.speed * np.exp(part["sound-speed"][0]) if "sound-speed" in part else self.speed,
+            self.delay + part["delay"][0] if "delay" in part else self.delay,
         )
 
 
