@@ -68,7 +68,10 @@ def test_on_a_straight_array_points_with_covariances_say_the_same():
     )
     found = jnp.median(jnp.asarray(jaxcal.segment(data, robust=False).noise_mm))
     spread = jnp.sqrt(jnp.mean(jnp.diagonal(covariance, axis1=1, axis2=2), axis=0))
-    points = jaxcal.calibrate(problem, sigma=jnp.append(spread, offset), data="points")
+    # In a batch images are independent, as they are for channels; one problem is examined for
+    # errors that are alike in successive images.
+    alone = jaxcal.stack([problem])
+    points = jaxcal.calibrate_batch(alone, sigma=jnp.append(spread, offset), data="points")[0]
     channels = jaxcal.calibrate(problem, sigma=jnp.stack([found, offset]), data="channels")
     between = np.linalg.inv(points.image_to_probe) @ np.asarray(channels.image_to_probe)
     sd = np.sqrt(np.diag(channels.covariance))
