@@ -7,17 +7,18 @@ J_k' J_k. If the errors of kind k have the covariance C_k over the images, that 
     S^-1 (sum_k J_k' C_k J_k) S^-1
 
 instead of S^-1. How much larger this is depends on the order of the poses: where the poses change
-at random, a drift hardly matters; where they change as slowly as the errors, it dominates.
+at random, a drift matters only through the mean of the errors, which shifts X; where they change as
+slowly as the errors, it dominates.
 
 A share a of the variance of each kind is correlated by rho^|i - j| between images i and j, the rest
 is independent. The residuals do not show C_k as it is, since the fit absorbs slow errors more than
 quick ones. So every pair (rho, a) of a grid is weighed by its restricted likelihood given those
 residuals (profiled over the variance), times a prior: half for no correlation, the other half
 spread evenly over the grid. The other kinds enter with their mean weights, in turn. C_k is then the
-weighed mean, which is the law of total variance, since every pair has the same estimate. So errors
-that look independent change the covariance by one to two percent if the poses change at random, and
-there is no threshold. Few images along a slow path cannot tell a drift from a movement: their
-covariance grows even if their errors are independent. The correction never makes an answer more
+weighed mean, which is the law of total variance, since every pair has the same estimate. So SDs
+grow by one to three percent where errors look independent and the poses change at random; nothing
+decides whether errors are correlated. Few images along a slow path cannot tell a drift from a
+movement: their SDs grow even if their errors are independent. The correction makes no answer more
 certain. The information P of priors on sound speed and delay is added to both sums.
 
 The cosine transform of a stationary series has nearly independent coefficients, whose variances are
