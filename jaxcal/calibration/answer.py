@@ -18,8 +18,6 @@ pivots of A - c 1 show whether the smallest eigenvalue of a matrix A exceeds a n
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -29,21 +27,25 @@ from jaxcal.data.problem import Problem
 from jaxcal.data.recording import MINIMUM_IMAGES
 from jaxcal.diagnostics.uncertainty import AT_BOUND, LARGEST_SD, mm_at_target, threshold
 from jaxcal.model.batch import ImagePlanes, Iterate, barrier, targets
-from jaxcal.model.distributions import OffsetLaw
+from jaxcal.model.observations import (
+    BoundedOffsets,
+    FurtherUnknowns,
+    LocalUnknown,
+    local_unknowns,
+)
 from jaxcal.model.parameters import Parameters
 from jaxcal.model.thresholds import LARGEST_ELEVATION, MINIMUM_SELF_TUNING
 from jaxcal.model.unknowns import (
-    FURTHER,
-    TABLE,
     Blocks,
     block_slice,
     count_unknowns,
-    measured,
     with_prior,
 )
 from jaxcal.result.calibration import Calibration, Linearisation, Medium, Status
 from jaxcal.solvers.convergence import Convergence
 from jaxcal.solvers.dense import inverse_batch_last
+from jaxcal.solvers.methods import Solution
+from jaxcal.solvers.normal_equations import accumulate, information_and_design
 from jaxcal.solvers.plan import Given, SolvePlan
 
 LEAST_GAP_MM = 1e-6
@@ -54,138 +56,101 @@ LEAST_HOLD = 1e-6
 root mean square residuals."""
 
 
-class Solved(eqx.Module):
-    """Where a method stopped; one problem, or a batch with leading axes on every array.
-
-    Attributes:
-        parameters: X, target and further unknowns. If the answer is to be differentiated, they are
-            functions of the data, and so are the following.
-        offset: offset unknowns, mm, or in the tracker's SDs for tracker noise; k = 0 where they
-            were eliminated.
-        sigma: SDs by which residuals are divided, of the kinds in :attr:`Observation.error_sd`, mm;
-            None for residuals in mm.
-        bound: on the offsets, mm; None where there is none.
-        information: of the shared unknowns, offsets eliminated.
-        design: of the unweighted residuals, offsets known.
-        convergence: how the method ended.
-        prior_sd: prior SDs of further unknowns, as in :class:`Linearisation`.
-    """
-
-    parameters: Parameters
-    offset: Float[Array, "*batch k"]
-    sigma: Float[Array, "*batch 3"] | None
-    bound: Float[Array, "*batch n"] | None
-    information: Float[Array, "*batch p p"]
-    design: Float[Array, "*batch p p"]
-    convergence: Convergence
-    prior_sd: Float[Array, "*batch priors"] | None
-
-
-class Average(eqx.Module):
-    """The average over the offsets' laws; batch axis first.
-
-    Attributes:
-        covariance: of the unknowns.
-        elevation_sd: SDs of the offsets, mm.
-        law: the result about the distribution of the offsets.
-    """
-
-    covariance: Float[Array, "batch p p"]
-    elevation_sd: Float[Array, "batch n"]
-    law: OffsetLaw
-
-
 def assemble(
-    solved: Solved,
-    averaged: Average | None,
-    problem: Problem,
-    images: ImagePlanes,
-    given: Given,
-    plan: SolvePlan,
+    found: Solution, problem: Problem, images: ImagePlanes, given: Given, plan: SolvePlan
 ) -> Calibration:
     """A calibration without its problem, which the caller adds with ``with_problem``.
 
     Args:
-        solved: where the method stopped.
-        averaged: the average over the offsets' distributions, where they were weighed; the
-            parameters and SDs of ``solved`` are then the average's.
-        problem: the images in use, with one leading axis as in ``solved``.
+        found: where the method stopped. If the answer is to be differentiated, its arrays are
+            functions of the data.
+        problem: the images in use, with one leading axis.
         images: the same as planes.
         given: the numbers in the request, without leading axes.
         plan: what is static about the request.
     """
     problem = problem.cleared(problem.mask)
-    # Without this barrier the compiler would repeat the end of the solve for every image. The
-    # matrices stay outside it: it would move their batch axis to the front, and back again.
-    parts = (solved.parameters, solved.offset, solved.sigma, solved.bound, solved.convergence)
-    parameters, offset, sigma, bound, convergence = barrier(parts)
-    solved = replace(
-        solved,
-        parameters=parameters,
-        offset=offset,
-        sigma=sigma,
-        bound=bound,
-        convergence=convergence,
+    observation = found.observation
+    information, design = barrier(_normal_matrices(found, images))
+    # Without this barrier the compiler would repeat the end of the solve for every image.
+    iterate, local, sigma, bound, convergence = barrier(
+        (
+            found.iterate,
+            local_unknowns(found.iterate, observation, images)
+            if isinstance(observation, LocalUnknown)
+            else None,
+            observation.sigma.T[:, [*observation.error_sd]] if observation.whitened else None,
+            observation.bound if isinstance(observation, BoundedOffsets) else None,
+            found.convergence,
+        )
     )
-    blocks, mask = plan.blocks, problem.mask
+    blocks, mask, parameters = plan.blocks, problem.mask, iterate.parameters()
     used = jnp.sum(mask, axis=-1)
-    errors = Errors.of(parameters, images, blocks)
-    elevation = _elevation(solved, errors, given, problem)
+    errors = Errors.of(iterate, images)
+    elevation = mask * errors.q[1]
     in_plane = errors.squares(errors.q[1])
 
     variance, bounds = jnp.ones_like(used), None
-    if solved.bound is not None:
-        bounds = ActiveBounds.of(errors, solved.offset, solved.bound, problem)
+    if bound is not None and local is not None:
+        elevation = mask * local
+        bounds = ActiveBounds.of(errors, local, bound)
         free = used - jnp.sum(bounds.resting, axis=-1)
         variance = bounds.cost / jnp.maximum(3 * used - count_unknowns(blocks) - free, 1.0)
     elif plan.prior == "none":
         variance = in_plane / jnp.maximum(3 * used - count_unknowns(blocks), 1.0)
 
-    lever = jax.lax.stop_gradient(errors.lever(mask))
+    lever = jax.lax.stop_gradient(errors.lever())
     covariance, observed = covariance_and_observability(
-        jnp.moveaxis(solved.information, 0, -1),
-        jnp.moveaxis(solved.design, 0, -1),
+        information,
+        design,
         variance,
         mm_at_target(lever, blocks).T,
         LARGEST_SD * lever,
         bounded=plan.prior == "bounded",
     )
-    covariance = jnp.moveaxis(covariance, -1, 0)
+    covariance, averaged = jnp.moveaxis(covariance, -1, 0), found.averaged
     if averaged is not None:
         # What the Gaussian solution cannot determine at all stays unknown.
         better = averaged.law.weighed[..., None, None] & jnp.isfinite(covariance)
-        covariance = jnp.where(better, averaged.covariance, covariance)
-    status = _status(solved, observed, used)
+        covariance = jnp.where(better, jnp.moveaxis(averaged.covariance, -1, 0), covariance)
+    status = _status(iterate, convergence, observed, used)
     known = (status != Status.UNOBSERVABLE)[..., None, None]
     covariance = jnp.where(known, covariance, jnp.nan)
-    channel_sigma = None if not plan.channels or solved.sigma is None else solved.sigma[..., 0]
+    if sigma is None:
+        three_sigmas = _residual_sds(errors, elevation, blocks, bounded=bound is not None)
+    elif plan.channels:
+        point_sd = sigma[..., :2] * _point_sd(errors, problem)
+        three_sigmas = jnp.concatenate([point_sd, sigma[..., 2:]], axis=-1)
+    else:
+        three_sigmas = sigma
     tracker_sd = None
-    if given.tracker_sd is not None:
+    if given.tracker_sd is not None and local is not None:
+        elevation = mask * (errors.q[1] + given.tracker_sd * local)
         tracker_sd = jnp.broadcast_to(given.tracker_sd, used.shape)
     return Calibration(
         image_to_probe=_matrix(parameters),
         point=parameters.point,
         elevation=elevation,
-        sigma=_three_sigmas(solved, errors, elevation, problem, plan),
+        sigma=three_sigmas,
         offset_law=None if averaged is None else averaged.law,
-        channel_sigma=channel_sigma,
+        channel_sigma=None if sigma is None or not plan.channels else sigma[..., 0],
         unknowns_covariance=covariance,
         scale_mm_per_px=problem.spacing * parameters.scale if problem.pixels else None,
         medium=_medium(parameters, covariance, problem, given, plan),
         rms=jnp.sqrt(in_plane / used),
         mask=mask,
         status_code=status,
-        differentiable=_is_differentiable(solved, bounds, observed, status, plan),
+        differentiable=_is_differentiable(convergence, bounds, observed, status, plan),
         sigma_tuned=jnp.asarray(plan.self_tuning) & (used >= MINIMUM_SELF_TUNING),
-        convergence=solved.convergence,
+        convergence=convergence,
         linearisation=Linearisation(
-            information=solved.information,
-            design=solved.design,
+            information=jnp.moveaxis(information, -1, 0),
+            design=jnp.moveaxis(design, -1, 0),
             variance=variance,
             tracker_sd=tracker_sd,
             average_elevation_sd=None if averaged is None else averaged.elevation_sd,
-            further=_further(parameters, blocks),
-            prior_sd=solved.prior_sd,
+            further=iterate.further_values.T if len(iterate.further_values) else None,
+            prior_sd=None if found.medium is None else found.medium.sd.T,
         ),
         problem=None,
         method=plan.method,
@@ -196,10 +161,18 @@ def assemble(
     )
 
 
-def _further(parameters: Parameters, blocks: Blocks) -> Float[Array, "*batch k"] | None:
-    """The free ones of the further unknowns, in one array; None where there are none."""
-    free = [parameters.further(name) for name in FURTHER if name in blocks]
-    return jnp.concatenate(free, axis=-1) if free else None
+def _normal_matrices(
+    found: Solution, images: ImagePlanes
+) -> tuple[Float[Array, "p p batch"], Float[Array, "p p batch"]]:
+    """S and D at a solution."""
+    observation, iterate = found.observation, found.iterate
+    geometry = observation.geometry(images, iterate.blocks)
+    if geometry is observation and observation.whitened:
+        return information_and_design(iterate, observation, images, found.medium)
+    weighted = accumulate(iterate, observation, images, None, found.medium).stacked()
+    if geometry is observation:
+        return weighted, weighted
+    return weighted, accumulate(iterate, geometry, images, None).stacked()
 
 
 class Errors(eqx.Module):
@@ -218,20 +191,16 @@ class Errors(eqx.Module):
     mask: Array
 
     @classmethod
-    def of(cls, parameters: Parameters, images: ImagePlanes, blocks: Blocks) -> Errors:
+    def of(cls, iterate: Iterate, images: ImagePlanes) -> Errors:
         """The errors at given unknowns."""
-        mask = images.mask
-        q, _ = targets(Iterate.of(parameters, blocks), images)
-        further = {
-            name: [values[..., k, None] for k in range(TABLE[name].size)]
-            for name, values in ((name, parameters.further(name)) for name in FURTHER)
-        }
-        lateral, distance = measured(images.lateral, images.axial, images.face[:, None], further)
+        q, _ = targets(iterate, images)
+        lateral, distance = FurtherUnknowns.at(iterate).points(images)
         # The range has no derivative at 0, and an image left out may put the target there.
         x, y, z = (
-            jnp.where(mask > 0, value, unused) for value, unused in zip(q, (0, 0, 1), strict=True)
+            jnp.where(images.mask > 0, value, unused)
+            for value, unused in zip(q, (0, 0, 1), strict=True)
         )
-        return cls((x, y, z), lateral, distance, mask)
+        return cls((x, y, z), lateral, distance, images.mask)
 
     def squares(self, *planes: Array, axial: Array | None = None) -> Float[Array, "*batch"]:
         """Sum over the images of |q - (lateral, 0, axial)|^2; axial is the range by default.
@@ -242,17 +211,10 @@ class Errors(eqx.Module):
         parts = (self.q[0] - self.lateral, *planes, self.q[2] - axial)
         return jnp.sum(self.mask * sum(part**2 for part in parts), axis=-1)
 
-    def lever(self, mask: Array) -> Float[Array, "*batch"]:
+    def lever(self) -> Float[Array, "*batch"]:
         """Root mean square distance of the measured points from the image origin, mm."""
-        squares = mask * (self.lateral**2 + self.distance**2)
-        return jnp.sqrt(jnp.sum(squares, axis=-1) / jnp.sum(mask, axis=-1))
-
-    def mean_squares(self) -> tuple[Array, Array]:
-        """Sums over the images of the squared lateral and range errors, mm^2."""
-        distance = jnp.sqrt(self.q[1] ** 2 + self.q[2] ** 2)
-        errors = (self.q[0] - self.lateral, distance - self.distance)
-        lateral, distance = (jnp.sum(self.mask * error**2, axis=-1) for error in errors)
-        return lateral, distance
+        squares = self.mask * (self.lateral**2 + self.distance**2)
+        return jnp.sqrt(jnp.sum(squares, axis=-1) / jnp.sum(self.mask, axis=-1))
 
 
 class ActiveBounds(eqx.Module):
@@ -272,9 +234,7 @@ class ActiveBounds(eqx.Module):
     hold: Float[Array, "*batch"]
 
     @classmethod
-    def of(
-        cls, errors: Errors, y: Float[Array, "*batch n"], bound: Array, problem: Problem
-    ) -> ActiveBounds:
+    def of(cls, errors: Errors, y: Float[Array, "*batch n"], bound: Array) -> ActiveBounds:
         """The state at offsets y."""
         distance, mask = errors.distance, errors.mask
         axial = jnp.sqrt(jnp.maximum(distance**2 - y**2, (1e-6 * distance) ** 2))
@@ -361,13 +321,14 @@ def covariance_and_observability(
 
 
 def _status(
-    solved: Solved, observed: Observability, used: Float[Array, "*batch"]
+    iterate: Iterate,
+    convergence: Convergence,
+    observed: Observability,
+    used: Float[Array, "*batch"],
 ) -> Int[Array, "*batch"]:
-    parameters, convergence = solved.parameters, solved.convergence
     finite = jnp.isfinite(convergence.cost)
-    for leaf in jax.tree.leaves(parameters):
-        own = tuple(range(finite.ndim, leaf.ndim))
-        finite = finite & jnp.all(jnp.isfinite(leaf), axis=own)
+    for leaf in jax.tree.leaves(iterate):
+        finite = finite & jnp.all(jnp.isfinite(leaf), axis=tuple(range(leaf.ndim - 1)))
     failed = jnp.logical_not(finite) | (used < MINIMUM_IMAGES)
     status = jnp.where(convergence.tolerance_met, Status.CONVERGED, Status.MAX_ITERATIONS)
     status = jnp.where(observed.degenerate | observed.weak, Status.UNOBSERVABLE, status)
@@ -375,14 +336,13 @@ def _status(
 
 
 def _is_differentiable(
-    solved: Solved,
+    convergence: Convergence,
     bounds: ActiveBounds | None,
     observed: Observability,
     status: Int[Array, "*batch"],
     plan: SolvePlan,
 ) -> Bool[Array, "*batch"]:
     """Whether the implicit function theorem's conditions hold at the solution."""
-    convergence = solved.convergence
     still = 1e-6 if float(jnp.finfo(convergence.cost.dtype).eps) < 1e-10 else 1e-3
     good = (status == Status.CONVERGED) & (convergence.stationarity <= still)
     good = good & jnp.logical_not(jnp.any(convergence.sigma_floored, axis=-1))
@@ -400,36 +360,21 @@ def _matrix(parameters: Parameters) -> Float[Array, "*batch 4 4"]:
     return jnp.concatenate([top, bottom], axis=-2)
 
 
-def _elevation(
-    solved: Solved, errors: Errors, given: Given, problem: Problem
-) -> Float[Array, "*batch n"]:
-    if solved.bound is not None:
-        return problem.mask * solved.offset
-    if given.tracker_sd is None:
-        return problem.mask * errors.q[1]
-    return problem.mask * (errors.q[1] + given.tracker_sd * solved.offset)
-
-
-def _three_sigmas(
-    solved: Solved,
-    errors: Errors,
-    elevation: Float[Array, "*batch n"],
-    problem: Problem,
-    plan: SolvePlan,
+def _residual_sds(
+    errors: Errors, elevation: Float[Array, "*batch n"], blocks: Blocks, *, bounded: bool
 ) -> Float[Array, "*batch 3"]:
-    """SDs of lateral position, range and offset, mm: those that whiten, or the residuals' own."""
-    if solved.sigma is not None and not plan.channels:
-        return solved.sigma
-    if solved.sigma is not None:
-        point_sd = solved.sigma[..., :2] * _point_sd(errors, problem)
-        return jnp.concatenate([point_sd, solved.sigma[..., 2:]], axis=-1)
-    used = jnp.sum(problem.mask, axis=-1)
+    """SDs of lateral position, range and offset, mm, from the residuals of a fit in mm."""
+    used = jnp.sum(errors.mask, axis=-1)
     # The unknowns' degrees of freedom are shared equally by the three components.
-    freedom = jnp.maximum(used - count_unknowns(plan.blocks) / 3, 1.0)
-    lateral, distance = (square / freedom for square in errors.mean_squares())
+    freedom = jnp.maximum(used - count_unknowns(blocks) / 3, 1.0)
+    distance = jnp.sqrt(errors.q[1] ** 2 + errors.q[2] ** 2)
+    lateral, axial = (
+        jnp.sum(errors.mask * error**2, axis=-1) / freedom
+        for error in (errors.q[0] - errors.lateral, distance - errors.distance)
+    )
     # Offsets within a bound have a root mean square within it, too.
-    own = used if solved.bound is not None else freedom
-    return jnp.sqrt(jnp.stack([lateral, distance, jnp.sum(elevation**2, axis=-1) / own], axis=-1))
+    own = used if bounded else freedom
+    return jnp.sqrt(jnp.stack([lateral, axial, jnp.sum(elevation**2, axis=-1) / own], axis=-1))
 
 
 def _point_sd(errors: Errors, problem: Problem) -> Float[Array, "*batch 2"]:

@@ -13,17 +13,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxcal.calibration.answer import Average, Solved, assemble
+from jaxcal.calibration.answer import assemble
 from jaxcal.data.problem import Problem
-from jaxcal.model.batch import ImagePlanes, barrier
-from jaxcal.model.observations import BoundedOffsets, LocalUnknown, local_unknowns
+from jaxcal.model.batch import ImagePlanes
 from jaxcal.model.unknowns import Blocks
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.jax_modes import in_standard_promotion
 from jaxcal.solvers import methods
 from jaxcal.solvers.consensus import find_consensus, rigid_model
-from jaxcal.solvers.methods import Solution
-from jaxcal.solvers.normal_equations import accumulate, information_and_design
 from jaxcal.solvers.plan import Given, SolvePlan
 from jaxcal.solvers.start import ConventionalStart, GivenStart
 
@@ -56,16 +53,25 @@ def solve_problems(
         problems = replace(problems, mask=agreed)
     # What is neither used nor left out must not count as something between: its problem fails.
     problems = replace(problems, mask=jnp.where(is_mask, problems.mask, jnp.nan))
-    if plan.one_by_one:
-        solution = jax.lax.map(
-            lambda problem: _solved(*_alone(problem, plan), given, plan), problems
-        )
-        solved, averaged = jax.tree.map(lambda leaf: leaf[:, 0], solution)
-        images = ImagePlanes.of(problems)
-    else:
-        images = ImagePlanes.of(problems, channels=plan.channels)
-        solved, averaged = _solved(problems, images, given, plan, begun)
-    return assemble(solved, averaged, problems, images, given, plan)
+    if not plan.one_by_one:
+        return _solved(problems, given, plan, begun)
+
+    def alone(problem: Problem) -> Calibration:
+        one = _solved(jax.tree.map(lambda leaf: leaf[None], problem), given, plan)
+        return jax.tree.map(lambda leaf: leaf[0], one)
+
+    return jax.lax.map(alone, problems)
+
+
+def _solved(
+    problems: Problem,
+    given: Given,
+    plan: SolvePlan,
+    begun: ConventionalStart | GivenStart | None = None,
+) -> Calibration:
+    images = ImagePlanes.of(problems, channels=plan.channels)
+    found = methods.solve(problems, images, given, plan, begun)
+    return assemble(found, problems, images, given, plan)
 
 
 def _one_at_a_time(blocks: Blocks):
@@ -78,53 +84,3 @@ def _one_at_a_time(blocks: Blocks):
 def agreed_images(problem: Problem, blocks: Blocks) -> Float[Array, " n"]:
     """1 for the used images of one problem that agree with each other."""
     return find_consensus(jax.lax.stop_gradient(problem), rigid_model(blocks)).keep
-
-
-def _alone(problem: Problem, plan: SolvePlan) -> tuple[Problem, ImagePlanes]:
-    """A batch of one."""
-    batch = jax.tree.map(lambda leaf: leaf[None], problem)
-    return batch, ImagePlanes.of(batch, channels=plan.channels)
-
-
-def _solved(
-    problems: Problem,
-    images: ImagePlanes,
-    given: Given,
-    plan: SolvePlan,
-    begun: ConventionalStart | GivenStart | None = None,
-) -> tuple[Solved, Average | None]:
-    """The method's solution with its normal matrices, problems first."""
-    found = methods.solve(problems, images, given, plan, begun)
-    observation = found.observation
-    information, design = barrier(_normal_matrices(found, images))
-    offset = jnp.zeros((images.batch_size, 0), images.mask.dtype)
-    if isinstance(observation, LocalUnknown):
-        offset = local_unknowns(found.iterate, observation, images)
-    solved = Solved(
-        parameters=found.iterate.parameters(),
-        offset=offset,
-        sigma=observation.sigma.T[:, [*observation.error_sd]] if observation.whitened else None,
-        bound=observation.bound if isinstance(observation, BoundedOffsets) else None,
-        information=jnp.moveaxis(information, -1, 0),
-        design=jnp.moveaxis(design, -1, 0),
-        convergence=found.convergence,
-        prior_sd=None if found.medium is None else found.medium.sd.T,
-    )
-    if found.covariance is None or found.elevation_sd is None or found.law is None:
-        return solved, None
-    covariance = jnp.moveaxis(found.covariance, -1, 0)
-    return solved, Average(covariance, found.elevation_sd, found.law)
-
-
-def _normal_matrices(
-    found: Solution, images: ImagePlanes
-) -> tuple[Float[Array, "p p batch"], Float[Array, "p p batch"]]:
-    """The weighted normal matrix at a solution, and that of the unweighted components."""
-    observation, iterate = found.observation, found.iterate
-    geometry = observation.geometry(images, iterate.blocks)
-    if geometry is observation and observation.whitened:
-        return information_and_design(iterate, observation, images, found.medium)
-    weighted = accumulate(iterate, observation, images, None, found.medium).stacked()
-    if geometry is observation:
-        return weighted, weighted
-    return weighted, accumulate(iterate, geometry, images, None).stacked()

@@ -12,11 +12,9 @@ from dataclasses import replace
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from jaxcal.data.problem import Problem
 from jaxcal.model.batch import ImagePlanes, Iterate
-from jaxcal.model.distributions import OffsetLaw
 from jaxcal.model.observations import (
     BoundedOffsets,
     ChannelDistances,
@@ -32,7 +30,7 @@ from jaxcal.model.observations import (
 from jaxcal.model.unknowns import TABLE, with_prior
 from jaxcal.solvers import implicit
 from jaxcal.solvers.alternating import Alternation, alternate, bounded
-from jaxcal.solvers.auto import average_over_laws
+from jaxcal.solvers.auto import Averaged, average_over_laws
 from jaxcal.solvers.convergence import Convergence
 from jaxcal.solvers.gradient_descent import pairwise_gradient
 from jaxcal.solvers.levenberg_marquardt import Minimum, minimise
@@ -49,25 +47,22 @@ FALLBACK_CHANNEL_SIGMA = (0.5, 1.0)
 
 
 class Solution(eqx.Module):
-    """Where a method stopped; the batch axis is last, except in the law and the convergence.
+    """Where a method stopped; the batch axis is last, except in the convergence.
 
     Attributes:
         iterate: X, c and the further unknowns.
         observation: the objective, with its SDs.
         medium: prior of further unknowns, or None.
         convergence: how the method ended.
-        covariance: of the unknowns over all laws of the offsets, where they were weighed.
-        elevation_sd: SDs of the offsets over all laws, mm, where they were weighed.
-        law: what was found out about the offsets' law, where laws were weighed.
+        averaged: the average over the offsets' laws, where they were weighed; ``iterate`` and
+            the SDs of ``observation`` are then the average's.
     """
 
     iterate: Iterate
     observation: Observation
     medium: MediumPrior | None
     convergence: Convergence
-    covariance: Float[Array, "p p batch"] | None = None
-    elevation_sd: Float[Array, "batch n"] | None = None
-    law: OffsetLaw | None = None
+    averaged: Averaged | None = None
 
 
 def solve(
@@ -275,11 +270,4 @@ def _averaged(found: Solution, images: ImagePlanes, problems: Problem, plan: Sol
         unit = jnp.asarray([1.0, 0.0, 1.0], shape.dtype)[:, None, None]
         shape = jnp.where(over.own_covariances[:, None], shape, unit)
         observation = OwnCovariances(over.sigma, shape, over.sigma[1] / over.sigma[0])
-    return replace(
-        found,
-        iterate=over.iterate,
-        observation=observation,
-        covariance=over.covariance,
-        elevation_sd=over.elevation_sd,
-        law=over.law,
-    )
+    return replace(found, iterate=over.iterate, observation=observation, averaged=over)
