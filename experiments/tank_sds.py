@@ -53,7 +53,7 @@ class PlacedOffsets(Observation):
 @jax.jit
 def _minimised(problem: Problem, offset_sd: Array, sigma: Array) -> tuple[Array, Array]:
     images = ImagePlanes.of(problem)
-    begin = conventional(images, RIGID).fit.iterate
+    begin = conventional(images, RIGID).iterate
     given = jnp.concatenate([sigma.T, jnp.ones((1, sigma.shape[0]))])
     found = minimise(begin, PlacedOffsets(given, offset_sd), images).iterate.parameters()
     return found.rotation, found.translation

@@ -115,5 +115,5 @@ def initial_fit(problem: Problem, blocks: Blocks = RIGID) -> Parameters:
 @partial(jax.jit, static_argnums=1)
 def _initial_fit(problem: Problem, blocks: Blocks) -> Parameters:
     images = ImagePlanes.of(jax.tree.map(lambda leaf: leaf[None], problem))
-    found = conventional(images, blocks).fit.iterate.parameters()
+    found = conventional(images, blocks).iterate.parameters()
     return jax.tree.map(lambda leaf: leaf[0], found)

@@ -22,7 +22,7 @@ from jaxcal.runtime.jax_modes import in_standard_promotion
 from jaxcal.solvers import methods
 from jaxcal.solvers.consensus import find_consensus, rigid_model
 from jaxcal.solvers.plan import Given, SolvePlan
-from jaxcal.solvers.start import ConventionalStart, GivenStart
+from jaxcal.solvers.start import ConventionalStart
 
 
 def solve_problems(
@@ -30,7 +30,7 @@ def solve_problems(
     given: Given,
     plan: SolvePlan,
     agreed: Float[Array, "batch n"] | None = None,
-    begun: ConventionalStart | GivenStart | None = None,
+    begun: ConventionalStart | None = None,
 ) -> Calibration:
     """Solve a batch of problems (one leading axis).
 
@@ -67,7 +67,7 @@ def _solved(
     problems: Problem,
     given: Given,
     plan: SolvePlan,
-    begun: ConventionalStart | GivenStart | None = None,
+    begun: ConventionalStart | None = None,
 ) -> Calibration:
     images = ImagePlanes.of(problems, channels=plan.channels)
     found = methods.solve(problems, images, given, plan, begun)

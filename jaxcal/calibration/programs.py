@@ -21,7 +21,7 @@ from jaxcal.result.calibration import Calibration
 from jaxcal.runtime import compiler
 from jaxcal.solvers.closed_form.single import Start
 from jaxcal.solvers.plan import Given, SolvePlan
-from jaxcal.solvers.start import GivenStart
+from jaxcal.solvers.start import ConventionalStart
 
 
 def solve_one(
@@ -41,7 +41,7 @@ def solve_one(
         plan: what is static about the request.
     """
     alone = jax.tree.map(lambda leaf: leaf[None], (problem, agreed, start))
-    begun = None if start is None else GivenStart.of(alone[2], plan.blocks)
+    begun = None if start is None else ConventionalStart.of(alone[2], plan.blocks)
     result = solve_problems(alone[0], given, plan, alone[1], begun)
     return jax.tree.map(lambda leaf: leaf[0], result)
 

@@ -16,6 +16,8 @@ rounds of the alternation, which descend gently; the lowest of the three minima 
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -40,36 +42,16 @@ TURNS = (0.0, 1.0, -1.0)
 """Starts, in units of the rotation that moves a target at mean range by the mean bound."""
 
 
-class Alternation(eqx.Module):
-    """Where the alternation stopped.
+class Alternation(Minimum):
+    """Where the alternation stopped, or its state; the cosine is that of the bounded joint problem.
 
     Attributes:
-        iterate: X and c.
-        cost: sum of squared distances, mm^2.
-        cosine: gradient cosine of the bounded joint problem there.
-        iterations: rounds.
-        converged: it stopped because X had stopped moving, not at the round limit.
         rotation_change: X's rotation in the last round, rad.
         translation_change: X's translation in the last round, mm.
-        trace: cost after each of the first rounds, NaN beyond the last; None: not kept.
     """
 
-    iterate: Iterate
-    cost: Float[Array, " batch"]
-    cosine: Float[Array, " batch"]
-    iterations: Int[Array, " batch"]
-    converged: Bool[Array, " batch"]
     rotation_change: Float[Array, " batch"]
     translation_change: Float[Array, " batch"]
-    trace: Float[Array, "trace batch"] | None
-
-
-class _Rounds(eqx.Module):
-    iterate: Iterate
-    rounds: Int[Array, " batch"]
-    rotation_change: Float[Array, " batch"]
-    translation_change: Float[Array, " batch"]
-    trace: Float[Array, "trace batch"] | None
 
 
 def alternate(
@@ -105,47 +87,45 @@ def alternate(
         matrix, gradient = barrier((normal.stacked() * (1 + 16 * eps * eye), normal.gradient))
         return barrier(iterate.moved(barrier(dense.solve_batch_last(matrix, -gradient)))), held
 
-    def one_round(state: _Rounds) -> _Rounds:
+    def one_round(state: Alternation) -> Alternation:
         held = HeldOffsets.of(barrier(local_unknowns(state.iterate, observation, images)), images)
         after, _ = jax.lax.fori_loop(0, inner_steps, gauss_newton, (state.iterate, held))
         kept = state.trace
         if kept is not None:
-            kept = recorded(kept, state.rounds, accumulate(after, held, images, None).cost)
-        moved = _Rounds(
-            after,
-            state.rounds + 1,
-            chord_angle(state.iterate.rotation - after.rotation),
-            jnp.sqrt(jnp.sum((state.iterate.translation - after.translation) ** 2, axis=0)),
-            kept,
+            kept = recorded(kept, state.iterations, accumulate(after, held, images, None).cost)
+        moved = replace(
+            state,
+            iterate=after,
+            iterations=state.iterations + 1,
+            rotation_change=chord_angle(state.iterate.rotation - after.rotation),
+            translation_change=jnp.sqrt(
+                jnp.sum((state.iterate.translation - after.translation) ** 2, axis=0)
+            ),
+            trace=kept,
         )
         return choose(active(state), moved, state)
 
-    def active(state: _Rounds) -> Bool[Array, " batch"]:
+    def active(state: Alternation) -> Bool[Array, " batch"]:
         moving = state.rotation_change >= tolerance_rad
         moving = moving | (state.translation_change >= tolerance_mm)
-        return moving & (state.rounds < max_rounds)
+        return moving & (state.iterations < max_rounds)
 
-    state = _Rounds(
-        start,
-        jnp.zeros(none.shape, jnp.int32),
-        none + jnp.inf,
-        none + jnp.inf,
-        empty_trace(trace, none),
+    state = Alternation(
+        iterate=start,
+        cost=none,
+        cosine=none,
+        iterations=jnp.zeros(none.shape, jnp.int32),
+        converged=jnp.zeros(none.shape, bool),
+        trace=empty_trace(trace, none),
+        rotation_change=none + jnp.inf,
+        translation_change=none + jnp.inf,
     )
     state = jax.lax.while_loop(lambda state: jnp.any(active(state)), one_round, state)
     normal = barrier(accumulate(state.iterate, observation, images, None))
     rounding = Rounding.of(start, observation, images)
-    return Alternation(
-        iterate=state.iterate,
-        cost=normal.cost,
-        cosine=gradient_cosine(normal, rounding.vanished),
-        iterations=state.rounds,
-        converged=(state.rotation_change < tolerance_rad)
-        & (state.translation_change < tolerance_mm),
-        rotation_change=state.rotation_change,
-        translation_change=state.translation_change,
-        trace=state.trace,
-    )
+    still = (state.rotation_change < tolerance_rad) & (state.translation_change < tolerance_mm)
+    cosine = gradient_cosine(normal, rounding.vanished)
+    return replace(state, cost=normal.cost, cosine=cosine, converged=still)
 
 
 def bounded(

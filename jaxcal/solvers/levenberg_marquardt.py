@@ -27,6 +27,7 @@ References: More, "The Levenberg-Marquardt algorithm: implementation and theory"
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import fields
 from typing import Any
 
 import equinox as eqx
@@ -127,18 +128,19 @@ def judge_step(
 
 
 class Minimum(eqx.Module):
-    """Where :func:`minimise` stopped, for every problem; batch axis last.
+    """Where a method stopped, or how far its loop has come, for every problem; batch axis last.
 
     Attributes:
         iterate: the best unknowns that were found.
         cost: sum of squared (whitened) residuals; without a last step that was not evaluated.
         cosine: gradient cosine max_k |g_k| / (|J_k| |r|); after such a step, its bound.
-        iterations: number of evaluations.
-        converged: the gradient cosine met its tolerance, or steps gain nothing above rounding.
+        iterations: number of evaluations (of a solver of optimistix: its steps).
+        converged: the gradient cosine met its tolerance, or steps gain nothing above rounding. Of
+            other methods: their own rule is met.
         trace: best cost after each of the first evaluations; NaN beyond the last; None: not kept.
     """
 
-    iterate: Iterate
+    iterate: Any
     cost: Float[Array, " batch"]
     cosine: Float[Array, " batch"]
     iterations: Int[Array, " batch"]
@@ -146,13 +148,10 @@ class Minimum(eqx.Module):
     trace: Float[Array, "trace batch"] | None
 
 
-class Descent(eqx.Module):
+class Descent(Minimum):
     """The state of the loop, for every problem.
 
     Attributes:
-        iterate: the best unknowns so far.
-        cost: sum of squared (whitened) residuals at ``iterate``.
-        cosine: gradient cosine at ``iterate``; after a last step that was not evaluated, its bound.
         candidate: the unknowns to evaluate next.
         retry: ``candidate`` is ``iterate`` again, with more damping or without second derivatives.
         exact_used: 1 where the step to the candidate came from an exact curvature.
@@ -160,15 +159,9 @@ class Descent(eqx.Module):
         damping: Marquardt's lambda.
         predicted: predicted decrease of half the cost by the step to the candidate.
         stalled: number of successive steps without a gain above rounding.
-        iterations: number of evaluations.
-        converged: the gradient cosine met its tolerance, or steps gain nothing above rounding.
         active: the problem is not finished.
-        trace: best cost after each of the first evaluations; NaN beyond the last; None: not kept.
     """
 
-    iterate: Any
-    cost: Float[Array, " batch"]
-    cosine: Float[Array, " batch"]
     candidate: Any
     retry: Bool[Array, " batch"]
     exact_used: Float[Array, " batch"]
@@ -176,10 +169,7 @@ class Descent(eqx.Module):
     damping: Float[Array, " batch"]
     predicted: Float[Array, " batch"]
     stalled: Int[Array, " batch"]
-    iterations: Int[Array, " batch"]
-    converged: Bool[Array, " batch"]
     active: Bool[Array, " batch"]
-    trace: Float[Array, "trace batch"] | None = None
 
     @classmethod
     def before(
@@ -419,14 +409,7 @@ def minimise(
         )
 
     ended: Descent = jax.lax.while_loop(lambda state: jnp.any(state.active), one, begun)
-    return Minimum(
-        iterate=ended.iterate,
-        cost=ended.cost,
-        cosine=ended.cosine,
-        iterations=ended.iterations,
-        converged=ended.converged,
-        trace=ended.trace,
-    )
+    return Minimum(*(getattr(ended, field.name) for field in fields(Minimum)))
 
 
 def default_tolerance(dtype: jnp.dtype) -> float:

@@ -36,7 +36,7 @@ from jaxcal.solvers.gradient_descent import pairwise_gradient
 from jaxcal.solvers.levenberg_marquardt import Minimum, minimise
 from jaxcal.solvers.plan import DEFAULT_MAX_ELEVATION_MM, Given, Options, SolvePlan
 from jaxcal.solvers.reml import SelfTuned, on_floor, self_tuned
-from jaxcal.solvers.start import ConventionalStart, GivenStart, conventional
+from jaxcal.solvers.start import ConventionalStart, conventional
 from jaxcal.solvers.with_optimistix import Fit, minimise_with, self_tuned_with
 
 FALLBACK_SIGMA = (0.5, 0.5, 1.0)
@@ -70,7 +70,7 @@ def solve(
     images: ImagePlanes,
     given: Given,
     plan: SolvePlan,
-    begun: ConventionalStart | GivenStart | None = None,
+    begun: ConventionalStart | None = None,
 ) -> Solution:
     """Solve a batch (one leading axis); images left out must hold harmless values.
 
@@ -145,7 +145,7 @@ def observe(
 
 
 def run(
-    begun: ConventionalStart | GivenStart,
+    begun: ConventionalStart,
     problems: Problem,
     images: ImagePlanes,
     given: Given,
@@ -180,21 +180,21 @@ def run(
 
 
 def _descended(
-    begun: ConventionalStart | GivenStart,
+    begun: ConventionalStart,
     observation: Observation,
     medium: MediumPrior | None,
     images: ImagePlanes,
     plan: SolvePlan,
-) -> Alternation | Minimum | Fit | SelfTuned:
+) -> Minimum:
     """Where the plan's method stops."""
     options, other, start = plan.options, plan.other_solver, begun.iterate
     limits = {"max_steps": options.max_iterations, "trace": options.trace}
     if plan.method == "conventional":
-        assert isinstance(begun, ConventionalStart)
         if options.solver == "gradient":
             return pairwise_gradient(begun.start, images, options)
         if other is not None:
             return minimise_with(other, begun.start, observation, images, None, options)
+        assert begun.fit is not None  # the closed form alone is no start of this method
         return begun.fit
     if isinstance(observation, BoundedOffsets):
         if plan.method != "alternating":

@@ -47,6 +47,7 @@ from jaxcal.solvers.levenberg_marquardt import (
     LARGEST_DAMPING,
     LEAST_DAMPING,
     MOST_STALLED,
+    Minimum,
     Rounding,
     StepJudgement,
     damped_step,
@@ -108,16 +109,16 @@ def helmert(
     return jnp.sqrt(jnp.maximum(squares, 0.0) / freedom)
 
 
-class SelfTuned(eqx.Module):
+class SelfTuned(Minimum):
     """The state of every problem; at the end, its answer.
 
+    A problem has converged if the SDs met their tolerance, and the gradient cosine met its own or
+    steps gain nothing above rounding.
+
     Attributes:
-        iterate: X, c and the further unknowns.
         sigma: the SDs, mm.
         updated: the SDs after one more update at ``iterate``, mm.
-        cost: sum of squared (weighted) residuals.
         change: largest relative change of the SDs by that update (its logarithm).
-        cosine: gradient cosine.
         candidate: the unknowns to evaluate next.
         proposed: the SDs at ``candidate``, mm.
         units: the SDs with which the residuals were formed in the last pass, mm.
@@ -128,19 +129,12 @@ class SelfTuned(eqx.Module):
         exact_used: 1 where the step came from exact second derivatives.
         damping: Marquardt's lambda.
         stalled: number of successive steps without a gain above rounding.
-        iterations: passes.
-        converged: the SDs met their tolerance, and the gradient cosine met its own or steps gain
-            nothing above rounding.
         active: the problem is not finished.
-        trace: best cost after each of the first passes; NaN beyond the last; None: not kept.
     """
 
-    iterate: Iterate
     sigma: Float[Array, "k batch"]
     updated: Float[Array, "k batch"]
-    cost: Float[Array, " batch"]
     change: Float[Array, " batch"]
-    cosine: Float[Array, " batch"]
     candidate: Iterate
     proposed: Float[Array, "k batch"]
     units: Float[Array, "k batch"]
@@ -151,10 +145,7 @@ class SelfTuned(eqx.Module):
     exact_used: Float[Array, " batch"]
     damping: Float[Array, " batch"]
     stalled: Int[Array, " batch"]
-    iterations: Int[Array, " batch"]
-    converged: Bool[Array, " batch"]
     active: Bool[Array, " batch"]
-    trace: Float[Array, "trace batch"] | None
 
     @classmethod
     def before(cls, start: Iterate, fallback: Float[Array, "k batch"], trace: int) -> SelfTuned:

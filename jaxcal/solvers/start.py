@@ -52,38 +52,26 @@ class ConventionalStart(eqx.Module):
     """Conventional fits, and how they began.
 
     Attributes:
-        fit: of Eq. 7.
+        fit: of Eq. 7; None where only its minimum is known.
         start: in closed form; where that was unsound, the fit itself.
         searched: whether a start had to be searched for.
     """
 
-    fit: Minimum
+    fit: Minimum | None
     start: Iterate
     searched: Bool[Array, " batch"]
 
     @property
     def iterate(self) -> Iterate:
         """The conventional fit, from which most methods start."""
-        return self.fit.iterate
-
-
-class GivenStart(eqx.Module):
-    """Conventional fits that were found before.
-
-    Attributes:
-        iterate: the conventional fits.
-        searched: whether they had to be searched for.
-    """
-
-    iterate: Iterate
-    searched: Bool[Array, " batch"]
+        return self.start if self.fit is None else self.fit.iterate
 
     @classmethod
-    def of(cls, start: Start, blocks: Blocks) -> GivenStart:
-        """From starts with a leading axis."""
+    def of(cls, start: Start, blocks: Blocks) -> ConventionalStart:
+        """From the closed forms' minima, with a leading axis."""
         plain = jax.vmap(Parameters.of)(start.rotation, start.translation, start.point, start.scale)
         parameters = replace(plain, sound_speed=start.sound_speed)
-        return cls(Iterate.of(parameters, blocks), start.searched)
+        return cls(None, Iterate.of(parameters, blocks), start.searched)
 
 
 class Reduced(eqx.Module):

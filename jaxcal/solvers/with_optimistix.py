@@ -11,13 +11,18 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
 
 from jaxcal.model.batch import ImagePlanes, Iterate, choose, targets
 from jaxcal.model.observations import FurtherUnknowns, MediumPrior, Observation
 from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
 from jaxcal.runtime.compiler import traced_once
-from jaxcal.solvers.levenberg_marquardt import Rounding, empty_trace, gradient_cosine
+from jaxcal.solvers.levenberg_marquardt import (
+    Minimum,
+    Rounding,
+    empty_trace,
+    gradient_cosine,
+)
 from jaxcal.solvers.normal_equations import accumulate, component_sums, weight_of
 from jaxcal.solvers.plan import Options
 from jaxcal.solvers.reml import update_at, with_floor
@@ -29,26 +34,14 @@ MOST_UPDATES = 60
 """Most updates of the SDs."""
 
 
-class Fit(eqx.Module):
-    """Where the solver stopped; batch axis last.
+class Fit(Minimum):
+    """Where the solver stopped; its trace is NaN, since the solver does not tell its values.
 
     Attributes:
-        iterate: X, c and the further unknowns.
-        cost: sum of squared (whitened) residuals.
-        cosine: gradient cosine there.
-        converged: by the solver's own rule.
-        iterations: the solver's steps.
         updated: SDs after the last update, mm; those given where none are tuned.
-        trace: NaN, since the solver does not tell its values; None: not kept.
     """
 
-    iterate: Iterate
-    cost: Float[Array, " batch"]
-    cosine: Float[Array, " batch"]
-    converged: Bool[Array, " batch"]
-    iterations: Int[Array, " batch"]
     updated: Float[Array, "k batch"]
-    trace: Float[Array, "trace batch"] | None
 
     @classmethod
     def of(
@@ -65,13 +58,13 @@ class Fit(eqx.Module):
         normal = accumulate(iterate, observation, images, None, medium)
         rounding = Rounding.of(start, observation, images)
         return cls(
-            iterate,
-            normal.cost,
-            gradient_cosine(normal, rounding.vanished),
-            (found.result == optx.RESULTS.successful)[None],
-            jnp.asarray(found.stats["num_steps"], jnp.int32)[None],
-            observation.sigma,
-            empty_trace(trace, normal.cost),
+            iterate=iterate,
+            cost=normal.cost,
+            cosine=gradient_cosine(normal, rounding.vanished),
+            iterations=jnp.asarray(found.stats["num_steps"], jnp.int32)[None],
+            converged=(found.result == optx.RESULTS.successful)[None],
+            trace=empty_trace(trace, normal.cost),
+            updated=observation.sigma,
         )
 
 
