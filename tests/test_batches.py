@@ -82,13 +82,13 @@ def test_compiler_flags_change_rounding_only(monkeypatch):
     fast = jaxcal.calibrate_batch(problems, method="conventional")
     again = jaxcal.calibrate_batch(problems, method="conventional")
     assert np.array_equal(fast.image_to_probe, again.image_to_probe)
-    from jaxcal.calibration import programs
+    from jaxcal.calibration import pipeline
 
-    programs.chunks.cache_clear()
+    pipeline.chunks.cache_clear()
     monkeypatch.setenv(compiler.SWITCH, "0")
     assert compiler.fast_to_run("cpu") is None
     plain = jaxcal.calibrate_batch(problems, method="conventional")
-    programs.chunks.cache_clear()
+    pipeline.chunks.cache_clear()
     np.testing.assert_allclose(fast.image_to_probe, plain.image_to_probe, rtol=0, atol=1e-12)
 
 

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import jaxcal
-from jaxcal.calibration import programs
+from jaxcal.calibration import pipeline
 from jaxcal.calibration.calibrate import Request, prepare
 from jaxcal.calibration.engine import fill_up
 from jaxcal.data.problem import taken
@@ -161,7 +161,7 @@ def test_images_left_out_between_others_change_nothing(problems):
 def test_the_answer_is_that_of_the_unpadded_problem(problems):
     nine = select(problems[0], slice(0, 9))
     nine, plan, given = prepare(nine, Request(method="conventional"))
-    solved = jax.jit(programs.solve_one, static_argnums=4)(nine, given, None, None, plan)
+    solved = jax.jit(pipeline.solve_one, static_argnums=4)(nine, given, None, None, plan)
     exact = solved.with_problem(nine)
     found = jaxcal.calibrate(nine, "conventional")
     assert found.elevation.shape == (9,)

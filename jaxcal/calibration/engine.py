@@ -3,7 +3,7 @@
 On a CPU, machine code is kept between processes (:mod:`jaxcal.runtime.executables`) in sizes that
 serve many problems; a program that is found there is neither imported, traced nor compiled. On
 other devices, inside somebody's jit, vmap or grad, and with a solver of the caller's own, JAX
-compiles :mod:`jaxcal.calibration.programs` as it compiles anything.
+compiles :mod:`jaxcal.calibration.pipeline` as it compiles anything.
 """
 
 from __future__ import annotations
@@ -60,8 +60,7 @@ def solve_problem(problem: Problem, given: Given, plan: SolvePlan) -> Calibratio
 
 def _solve_compiled(problem: Problem, given: Given, plan: SolvePlan) -> Calibration:
     """One problem by a program of JAX's own, which serves every method and prior."""
-    from jaxcal.calibration.pipeline import agreed_images
-    from jaxcal.calibration.programs import solve_one
+    from jaxcal.calibration.pipeline import agreed_images, solve_one
 
     platform = None
     if not inside_transformation(problem, given):
@@ -88,7 +87,7 @@ def _solve_kept(problem: Problem, given: Given, plan: SolvePlan) -> Calibration:
         used = replace(problem, mask=agreed[: problem.images])
     start = None if plan.method == "conventional" else closed_form_start(used, plan.blocks)
     arguments = (padded, given, agreed, start)
-    result = run("jaxcal.calibration.programs:solve_one", arguments, plan, label=label)
+    result = run("jaxcal.calibration.pipeline:solve_one", arguments, plan, label=label)
     return as_jax_holds(first_images(result, problem.images), problem)
 
 
@@ -180,7 +179,7 @@ def _solve_chunks_kept(
         padded = map_arrays(lambda leaf: np.asarray(leaf)[rows], padded)
     label = _label(plan, padded.images) | {"problems": size * chunk}
     result = executables.run(
-        "jaxcal.calibration.programs:solve_some_chunks",
+        "jaxcal.calibration.pipeline:solve_some_chunks",
         (padded, given, np.asarray(pieces, np.int32)),
         (plan, chunk),
         flags=compiler.batch_flags(),
@@ -197,7 +196,7 @@ def _solve_chunks_compiled(
     import jax
     import jax.numpy as jnp
 
-    from jaxcal.calibration import programs
+    from jaxcal.calibration import pipeline
 
     count = problems.mask.shape[0]
     alone = not inside_transformation(problems, given)
@@ -212,7 +211,7 @@ def _solve_chunks_compiled(
     if count and pieces * size != count:
         rows = jnp.arange(pieces * size) % count
         problems = jax.tree.map(lambda leaf: leaf[rows], problems)
-    return programs.chunks(devices, alone)(problems, given, plan, size)
+    return pipeline.chunks(devices, alone)(problems, given, plan, size)
 
 
 def _label(plan: SolvePlan, images: int) -> dict[str, Any]:

@@ -2,24 +2,31 @@
 
 If the plan is robust, the images that do not agree are found first. Then the plan's method solves
 the problems (:mod:`jaxcal.solvers.methods`), and the answer is put together
-(:mod:`jaxcal.calibration.answer`). :mod:`jaxcal.calibration.programs` compiles this function.
+(:mod:`jaxcal.calibration.answer`). :mod:`jaxcal.calibration.engine` decides in which of the forms
+at the end of this module it is compiled, and whether their machine code is kept.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import Array, Float, Int
 
 from jaxcal.calibration.answer import assemble
 from jaxcal.data.problem import Problem
 from jaxcal.model.batch import ImagePlanes
 from jaxcal.model.unknowns import Blocks
 from jaxcal.result.calibration import Calibration
+from jaxcal.runtime import compiler
 from jaxcal.runtime.jax_modes import in_standard_promotion
 from jaxcal.solvers import methods
+from jaxcal.solvers.closed_form.single import Start
 from jaxcal.solvers.consensus import find_consensus, rigid_model
 from jaxcal.solvers.plan import Given, SolvePlan
 from jaxcal.solvers.start import ConventionalStart
@@ -47,9 +54,12 @@ def solve_problems(
     problems = problems.cleared(problems.mask)
     if plan.robust:
         if agreed is None:
-            # Which images are left out is piecewise constant in the data, so it has no derivative.
+            # One problem at a time: its finalists fill the vector units, and several problems at
+            # once would not fit in the cache. Which images are left out is piecewise constant in
+            # the data, so it has no derivative.
+            search = in_standard_promotion(lambda problem: agreed_images(problem, plan.blocks))
             seen = jax.lax.stop_gradient(problems.points_only())
-            agreed = jax.vmap(_one_at_a_time(plan.blocks))(seen)
+            agreed = jax.vmap(jax.custom_batching.sequential_vmap(search))(seen)
         problems = replace(problems, mask=agreed)
     # What is neither used nor left out must not count as something between: its problem fails.
     problems = replace(problems, mask=jnp.where(is_mask, problems.mask, jnp.nan))
@@ -74,13 +84,90 @@ def _solved(
     return assemble(found, problems, images, given, plan)
 
 
-def _one_at_a_time(blocks: Blocks):
-    # One problem at a time, even in a batch: its finalists fill the vector units, and several
-    # problems at once would not fit in the cache.
-    agreed = in_standard_promotion(lambda problem: agreed_images(problem, blocks))
-    return jax.custom_batching.sequential_vmap(agreed)
-
-
 def agreed_images(problem: Problem, blocks: Blocks) -> Float[Array, " n"]:
     """1 for the used images of one problem that agree with each other."""
     return find_consensus(jax.lax.stop_gradient(problem), rigid_model(blocks)).keep
+
+
+def solve_one(
+    problem: Problem,
+    given: Given,
+    agreed: Float[Array, " n"] | None,
+    start: Start | None,
+    plan: SolvePlan,
+) -> Calibration:
+    """Solve one problem as a batch of one (traceable).
+
+    Args:
+        problem: checked.
+        given: numbers that came with the request.
+        agreed: 1 for the images to use, where a robust search was made before.
+        start: of all methods but the conventional; without it the program finds one.
+        plan: what is static about the request.
+    """
+    alone = jax.tree.map(lambda leaf: leaf[None], (problem, agreed, start))
+    begun = None if start is None else ConventionalStart.of(alone[2], plan.blocks)
+    result = solve_problems(alone[0], given, plan, alone[1], begun)
+    return jax.tree.map(lambda leaf: leaf[0], result)
+
+
+def solve_chunks(problems: Problem, given: Given, plan: SolvePlan, chunk: int) -> Calibration:
+    """Solve a batch whose size is a multiple of the chunk's (traceable)."""
+    count = problems.mask.shape[0]
+    if count == chunk:
+        return solve_problems(problems, given, plan)
+    chunks = jax.tree.map(lambda leaf: leaf.reshape((-1, chunk, *leaf.shape[1:])), problems)
+    result = jax.lax.map(lambda part: solve_problems(part, given, plan), chunks)
+    return jax.tree.map(lambda leaf: leaf.reshape((count, *leaf.shape[2:])), result)
+
+
+def solve_some_chunks(
+    problems: Problem, given: Given, used: Int[Array, ""], how: tuple[SolvePlan, int]
+) -> Calibration:
+    """Solve the first chunks of a batch. The others may hold anything; their results are zeros.
+
+    Args:
+        problems: a batch whose size is a multiple of the chunk's.
+        given: numbers that came with the request.
+        used: how many chunks to solve.
+        how: the plan and the chunk's size.
+    """
+    plan, chunk = how
+    count = problems.mask.shape[0]
+    if count == chunk:
+        return solve_problems(problems, given, plan)
+    parts = jax.tree.map(lambda leaf: leaf.reshape((-1, chunk, *leaf.shape[1:])), problems)
+
+    def solved(index: Array) -> Calibration:
+        return solve_problems(jax.tree.map(lambda leaf: leaf[index], parts), given, plan)
+
+    solved, nothing = compiler.traced_once(solved, used)
+
+    def body(index: Array, found: Calibration) -> Calibration:
+        one = solved(index)
+        return jax.tree.map(lambda all_of, part: all_of.at[index].set(part), found, one)
+
+    empty = jax.tree.map(
+        lambda leaf: jnp.broadcast_to(leaf, (count // chunk, *leaf.shape)), nothing
+    )
+    found = jax.lax.fori_loop(0, used, body, empty)
+    return jax.tree.map(lambda leaf: leaf.reshape((count, *leaf.shape[2:])), found)
+
+
+@cache
+def chunks(devices: tuple[Any, ...], alone: bool):
+    """The compiled solve of chunks, shared by the devices; ``alone``: as a program of its own."""
+    options = compiler.fast_to_run(devices[0].platform) if alone else None
+    if len(devices) == 1:
+        return jax.jit(solve_chunks, static_argnums=(2, 3), compiler_options=options)
+    mesh, cut = Mesh(np.asarray(devices), ("problems",)), PartitionSpec("problems")
+
+    def spread(problems: Problem, given: Given, plan: SolvePlan, chunk: int) -> Calibration:
+        def share(problems: Problem, given: Given) -> Calibration:
+            return solve_chunks(problems, given, plan, chunk)
+
+        specs = (cut, PartitionSpec())
+        mapped = jax.shard_map(share, mesh=mesh, in_specs=specs, out_specs=cut, check_vma=False)
+        return mapped(problems, given)
+
+    return jax.jit(spread, static_argnums=(2, 3), compiler_options=options)
