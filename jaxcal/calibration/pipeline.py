@@ -86,7 +86,7 @@ def _solved(
 
 def agreed_images(problem: Problem, blocks: Blocks) -> Float[Array, " n"]:
     """1 for the used images of one problem that agree with each other."""
-    return find_consensus(jax.lax.stop_gradient(problem), rigid_model(blocks)).keep
+    return find_consensus(jax.lax.stop_gradient(problem), rigid_model(blocks))
 
 
 def solve_one(

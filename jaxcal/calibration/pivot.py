@@ -38,6 +38,7 @@ from jaxcal.solvers.consensus import (
     FEWEST_IMAGES,
     ConsensusModel,
     find_consensus,
+    linearise,
     stands_out,
     studentised_errors,
 )
@@ -292,23 +293,22 @@ def _solve(poses: Float[Array, "n 4 4"], mask: Float[Array, " n"], *, robust: bo
         face_offset=jnp.zeros((), poses.dtype),
     )
     model = ConsensusModel(BLOCKS, _errors, _proposals, isotropic=True, subset=_SUBSET)
-    keep = find_consensus(everything, model).keep if robust else mask
+    keep = find_consensus(everything, model) if robust else mask
     problem = eqx.tree_at(lambda p: p.mask, everything, keep)
     parameters = jax.tree.map(lambda leaf: leaf[0], _proposals(problem, keep[None]))
     # The problem is linear; two steps remove the rounding errors of the moments.
-    information, gradient = _normal(parameters, problem)
-    diagonal = jnp.diagonal(information)
-    step = dense.solve_symmetric(information, gradient, diagonal)
-    parameters = retract(parameters, -step, BLOCKS)
-    _, gradient = _normal(parameters, problem)
-    step = dense.solve_symmetric(information, gradient, diagonal)
-    parameters = retract(parameters, -step, BLOCKS)
-    _, studentised = studentised_errors(parameters, everything, keep, model)
+    residual, jacobian = linearise(parameters, problem, model)
+    information = jnp.einsum("anm,bnm->ab", jacobian, jacobian)
+    for _ in range(2):
+        gradient = jnp.einsum("anm,nm->a", jacobian, residual)
+        step = dense.solve_symmetric(information, gradient, jnp.diagonal(information))
+        parameters = retract(parameters, -step, BLOCKS)
+        residual = _errors(parameters, problem)
+    studentised = studentised_errors(parameters, everything, keep, model)
     outlier = mask * (1 - keep)
     if not robust:
         judged = jnp.sum(mask) >= FEWEST_IMAGES
         outlier = mask * judged * stands_out(studentised, keep)
-    residual = _errors(parameters, problem)
     used = jnp.sum(keep)
     variance = jnp.sum(residual**2) / jnp.maximum(3 * used - 6, 1.0)
     length = jnp.sqrt(jnp.sum(parameters.translation**2))
@@ -343,20 +343,6 @@ def _solve(poses: Float[Array, "n 4 4"], mask: Float[Array, " n"], *, robust: bo
 def _errors(parameters: Parameters, problem: Problem) -> Float[Array, "n 3"]:
     # The tip is the origin of a tool's "image".
     return problem.mask[:, None] * target_in_image(parameters, problem)
-
-
-def _normal(
-    parameters: Parameters, problem: Problem
-) -> tuple[Float[Array, "6 6"], Float[Array, 6]]:
-    """The normal matrix of tip and point, and the gradient."""
-
-    def errors(tangent: Float[Array, 6]) -> Float[Array, "n 3"]:
-        return _errors(retract(parameters, tangent, BLOCKS), problem)
-
-    value, push = jax.linearize(errors, jnp.zeros(6, problem.mask.dtype))
-    jacobian = jax.vmap(push)(jnp.eye(6, dtype=problem.mask.dtype))
-    information = jnp.einsum("anm,bnm->ab", jacobian, jacobian)
-    return information, jnp.einsum("anm,nm->a", jacobian, value)
 
 
 def _spread(problem: Problem) -> Float[Array, ""]:

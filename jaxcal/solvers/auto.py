@@ -282,7 +282,7 @@ def answers_under(model: Linearised, sites: Sites, shapes: tuple[Shape, ...]) ->
     squares, pull = barrier(site_part(model.squares, model.pull))
     found = propagate(known, sites, squares, pull, families, stretch[:, None] * sd)
 
-    mean, covariance = barrier(known.lift()(found.mean, found.covariance))
+    mean, covariance = barrier(known.lifted(found.mean, found.covariance))
     variance = covariance[-1, -1]
     belief = mean_belief(model.mean + mean[-1], variance, sd, model.trust)
     weight, good = weights(found.log_evidence + log_evidence_gain(belief), found.change, prior)

@@ -33,7 +33,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -86,22 +85,6 @@ class ConsensusModel:
     subset: int = SUBSET
 
 
-class Consensus(eqx.Module):
-    """Which images agree.
-
-    Attributes:
-        keep: (n,) 1 for used images that agree, 0 otherwise.
-        parameters: the unknowns fitted to these images by a few Gauss-Newton steps.
-        sigma: (3,) SDs of the components over the images that agree, mm.
-        studentised_errors: (n, 3) errors in SDs, corrected for leverage; 0 for images masked out.
-    """
-
-    keep: Float[Array, " n"]
-    parameters: Parameters
-    sigma: Float[Array, 3]
-    studentised_errors: Float[Array, "n 3"]
-
-
 def rigid_model(blocks: Blocks) -> ConsensusModel:
     """The calibration's own model; a delay only shifts X."""
     kept = tuple(name for name in blocks if name != "delay")
@@ -121,8 +104,8 @@ def depth_scaled_errors(parameters: Parameters, problem: Problem) -> Float[Array
     return errors.at[:, 0].divide(jnp.where(problem.mask > 0, beyond, 1.0))
 
 
-def find_consensus(problem: Problem, model: ConsensusModel) -> Consensus:
-    """Find the images that agree, and every image's errors under the fit to them.
+def find_consensus(problem: Problem, model: ConsensusModel) -> Float[Array, " n"]:
+    """Find the images that agree: 1 for them, 0 for the others.
 
     Args:
         problem: one problem; images masked out stay out.
@@ -143,16 +126,12 @@ def find_consensus(problem: Problem, model: ConsensusModel) -> Consensus:
     # The first candidate takes all images as good; it competes with those that leave some out.
     chosen = jnp.concatenate([jnp.zeros(1, best.dtype), best + 1])
     everything = jnp.arange(count + 1) == 0
-    finished: Consensus
-    finished, cost = jax.vmap(partial(_finish, problem=problem, model=model))(
+    keep, cost = jax.vmap(partial(_finish, problem=problem, model=model))(
         jax.tree.map(lambda leaf: leaf[chosen], proposed), subsets[chosen], everything
     )
     winner = jnp.argmin(cost)
-    found: Consensus = jax.tree.map(lambda leaf: leaf[winner], finished)
     enough = (jnp.sum(used) >= FEWEST_IMAGES) & jnp.isfinite(cost[winner])
-    return Consensus(
-        jnp.where(enough, found.keep, used), found.parameters, found.sigma, found.studentised_errors
-    )
+    return jnp.where(enough, keep[winner], used)
 
 
 def finalists(images: int) -> int:
@@ -166,15 +145,15 @@ def _finish(
     all_good: Bool[Array, ""],
     problem: Problem,
     model: ConsensusModel,
-) -> tuple[Consensus, Float[Array, ""]]:
-    """Fit the subset, concentrate and reject; return the result and its cost (lower is better)."""
+) -> tuple[Float[Array, " n"], Float[Array, ""]]:
+    """Fit the subset, concentrate and reject; the images to keep, and the cost of keeping them."""
     used = problem.mask
     # Less than half of the images are no consensus.
     fewest = jnp.maximum(0.5 * jnp.sum(used), FEWEST_IMAGES)
 
     def one_round(index: Array, state: tuple[Parameters, Array]) -> tuple[Parameters, Array]:
         parameters, weight = state
-        errors, jacobian = _linearise(parameters, problem, model)
+        errors, jacobian = linearise(parameters, problem, model)
         concentrating = index < SUBSET_STEPS + CONCENTRATION_STEPS
         basis = jnp.where(index <= SUBSET_STEPS + CONCENTRATION_STEPS, used, weight)
         sigma = _robust(errors, basis, model)
@@ -195,7 +174,7 @@ def _finish(
 
     rounds = SUBSET_STEPS + CONCENTRATION_STEPS + REJECTION_STEPS
     parameters, keep = jax.lax.fori_loop(0, rounds, one_round, (parameters, used))
-    errors, jacobian = _linearise(parameters, problem, model)
+    errors, jacobian = linearise(parameters, problem, model)
     leverage = _leverage(jacobian, _robust(errors, keep, model), keep)
     sigma, freedom = _efficient(errors, leverage, keep, model)
     studentised = _studentise(errors, leverage, sigma, keep)
@@ -207,28 +186,25 @@ def _finish(
     wrong = wrong - jnp.log(WRONG_PROBABILITY)
     cost = cost + jnp.sum(jnp.where((used > 0) & (keep == 0), wrong, 0.0))
     sound = (jnp.sum(keep) >= fewest) & jnp.all(jnp.isfinite(studentised))
-    cost = jnp.where(sound & jnp.isfinite(cost), cost, jnp.inf)
-    return Consensus(keep, parameters, sigma, studentised), cost
+    return keep, jnp.where(sound & jnp.isfinite(cost), cost, jnp.inf)
 
 
 def studentised_errors(
     parameters: Parameters, problem: Problem, keep: Float[Array, " n"], model: ConsensusModel
-) -> tuple[Float[Array, 3], Float[Array, "n 3"]]:
-    """Every image's errors under the fit to the kept ones.
+) -> Float[Array, "n 3"]:
+    """Every image's errors under the fit to the kept ones, in SDs; 0 for images masked out.
+
+    The SDs are robust ones of the kept images, and the errors are corrected for leverage.
 
     Args:
         parameters: fitted to the kept images.
         problem: the data.
         keep: (n,) 1 for the images that were used for the fit.
         model: what the errors are.
-
-    Returns:
-        sigma: (3,) robust SDs of the kept images' errors, mm.
-        studentised_errors: (n, 3) errors in SDs, corrected for leverage; 0 for images masked out.
     """
-    errors, jacobian = _linearise(parameters, problem, model)
+    errors, jacobian = linearise(parameters, problem, model)
     sigma = _robust(errors, keep, model)
-    return sigma, _studentise(errors, _leverage(jacobian, sigma, keep), sigma, keep)
+    return _studentise(errors, _leverage(jacobian, sigma, keep), sigma, keep)
 
 
 def stands_out(studentised: Float[Array, "n 3"], keep: Float[Array, " n"]) -> Float[Array, " n"]:
@@ -283,9 +259,11 @@ def _studentise(
     return jnp.where(weight[:, None] > 0, inside, outside) / sigma
 
 
-def _linearise(
+def linearise(
     parameters: Parameters, problem: Problem, model: ConsensusModel
 ) -> tuple[Float[Array, "n 3"], Float[Array, "p n 3"]]:
+    """Every image's errors, and their derivatives by the unknowns."""
+
     def errors(tangent: Float[Array, " p"]) -> Float[Array, "n 3"]:
         return model.errors(retract(parameters, tangent, model.blocks), problem)
 

@@ -25,7 +25,8 @@ the target,
 so the sites do not depend on v_x, v_z, w_y or the further unknowns, and on v_y and the mean b only
 by their sum s. All other unknowns are eliminated once, exactly, from the measurements' likelihood
 (:func:`marginal`). The sweeps run on z = (s, w_x, w_z, d); each takes 21 + 6 sums over the images
-and a 6x6 inverse. The result under each law is carried back to all unknowns (:class:`Lift`).
+and a 6x6 inverse. The result under each law is carried back to all unknowns
+(:meth:`Marginal.lifted`).
 
 All laws share one program, in which only the quadratures of the moments differ. Within a family,
 each law starts with the sites of the law before it.
@@ -135,46 +136,33 @@ class Marginal(eqx.Module):
     slope: Float[Array, "h 6 batch"]
     spread: Float[Array, "h h batch"]
 
-    def lift(self) -> Lift:
-        """How all unknowns, b last, follow from z."""
-        eye = jnp.eye(len(SITE_UNKNOWNS), dtype=self.gradient.dtype)[..., None]
-        seen = jnp.broadcast_to(eye, (len(SITE_UNKNOWNS), *self.gradient.shape))
+    def lifted(
+        self, mean: Float[Array, "6 k batch"], covariance: Float[Array, "6 6 k batch"]
+    ) -> tuple[Float[Array, "q k batch"], Float[Array, "q q k batch"]]:
+        """Mean and covariance of all unknowns, b last, from those of z.
+
+        They are x = shift + slope z, with a spread for given z.
+        """
+        size = len(SITE_UNKNOWNS)
+        eye = jnp.eye(size, dtype=self.gradient.dtype)[..., None]
+        seen = jnp.broadcast_to(eye, (size, *self.gradient.shape))
         shift = jnp.concatenate([self.shift, jnp.zeros_like(self.gradient)])
         slope = jnp.concatenate([self.slope, seen])
-        spread = jnp.pad(self.spread, [(0, len(SITE_UNKNOWNS)), (0, len(SITE_UNKNOWNS)), (0, 0)])
+        spread = jnp.pad(self.spread, [(0, size), (0, size), (0, 0)])
         order = [*eliminated(len(shift) - 1), *SITE_UNKNOWNS]
         back = np.argsort(order)
         whole = jnp.concatenate([shift[:, None], slope, spread], axis=1)[back]
         # From s back to v_y = s - b.
         whole = whole - (np.arange(len(back)) == V_Y)[:, None, None] * whole[-1]
-        spread = whole[:, 1 + len(SITE_UNKNOWNS) :][:, back]
+        spread = whole[:, 1 + size :][:, back]
         sheared = (np.arange(len(back)) == V_Y)[None, :, None]
         spread = spread - sheared * spread[:, -1, None]
-        return barrier(Lift(whole[:, 0], whole[:, 1 : 1 + len(SITE_UNKNOWNS)], spread))
-
-
-class Lift(eqx.Module):
-    """All unknowns from z: x = shift + slope z, and a spread for given z; batch axis last.
-
-    Attributes:
-        shift: x at z = 0.
-        slope: by z.
-        spread: covariance of x for given z.
-    """
-
-    shift: Float[Array, "q batch"]
-    slope: Float[Array, "q 6 batch"]
-    spread: Float[Array, "q q batch"]
-
-    def __call__(
-        self, mean: Float[Array, "6 k batch"], covariance: Float[Array, "6 6 k batch"]
-    ) -> tuple[Float[Array, "q k batch"], Float[Array, "q q k batch"]]:
-        """Mean and covariance of all unknowns from those of z."""
-        slope = self.slope[:, :, None]
-        found = self.shift[:, None] + dense.product_batch_last(slope, mean)
+        shift, slope, spread = barrier((whole[:, 0], whole[:, 1 : 1 + size], spread))
+        slope = slope[:, :, None]
+        found = shift[:, None] + dense.product_batch_last(slope, mean)
         across = barrier(dense.product_batch_last(slope, covariance))
         back = jnp.swapaxes(slope, 0, 1)
-        return found, self.spread[:, :, None] + dense.product_batch_last(across, back)
+        return found, spread[:, :, None] + dense.product_batch_last(across, back)
 
 
 def marginal(
@@ -220,7 +208,7 @@ def marginal(
 
 
 class Posterior(eqx.Module):
-    """The belief about z under each law.
+    """The belief about z under a law, or under each of k laws.
 
     Attributes:
         mean: of z.
@@ -229,10 +217,10 @@ class Posterior(eqx.Module):
         change: length of the last sweep's move of the mean, in SDs.
     """
 
-    mean: Float[Array, "6 k batch"]
-    covariance: Float[Array, "6 6 k batch"]
-    log_evidence: Float[Array, "k batch"]
-    change: Float[Array, "k batch"]
+    mean: Float[Array, "6 *k batch"]
+    covariance: Float[Array, "6 6 *k batch"]
+    log_evidence: Float[Array, "*k batch"]
+    change: Float[Array, "*k batch"]
 
 
 def propagate(
@@ -271,13 +259,13 @@ def propagate(
             last.append((k, len(turns)))
             turns.append((which, k, False))
     under = _Laws(names, sites, known, squares, pull)
-    parts: list[_Found] = []
+    parts: list[Posterior] = []
     if turns:
         family, law, fresh = (jnp.asarray(column) for column in zip(*turns, strict=True))
         # The first turn starts afresh, so it does not use this state.
         gaussian, start = traced_once(under.gaussian, sd[0])
 
-        def one(state: _Propagation, turn: tuple) -> tuple[_Propagation, _Found]:
+        def one(state: _Propagation, turn: tuple) -> tuple[_Propagation, Posterior]:
             family, sd, fresh = turn
             state = jax.lax.cond(fresh, lambda: gaussian(sd), lambda: state)
             return under.swept(family, sd, state, sweeps)
@@ -287,10 +275,9 @@ def propagate(
         last.append((k, len(turns) + exact.index(k)))
         parts.append(jax.tree.map(lambda leaf: leaf[None], under.under_gaussian(sd[k])))
     order = jnp.asarray([turn for _, turn in sorted(last)])
-    found = barrier(
+    return barrier(
         jax.tree.map(lambda *leaf: jnp.moveaxis(jnp.concatenate(leaf)[order], 0, -2), *parts)
     )
-    return Posterior(found.mean, found.covariance, found.log_evidence, found.change)
 
 
 class _Belief(eqx.Module):
@@ -312,13 +299,6 @@ class _Propagation(eqx.Module):
     tau: Float[Array, "batch n"]
     nu: Float[Array, "batch n"]
     belief: _Belief
-
-
-class _Found(eqx.Module):
-    mean: Float[Array, "6 batch"]
-    covariance: Float[Array, "6 6 batch"]
-    log_evidence: Float[Array, " batch"]
-    change: Float[Array, " batch"]
 
 
 def site_part(
@@ -354,16 +334,16 @@ class _Laws(eqx.Module):
         )
         return _Propagation(tau, jnp.zeros_like(tau), belief)
 
-    def under_gaussian(self, sd: Float[Array, " batch"]) -> _Found:
+    def under_gaussian(self, sd: Float[Array, " batch"]) -> Posterior:
         """The result under the Gaussian law itself."""
         belief = self.gaussian(sd).belief
         used, square = total([self.sites.used, self.sites.used * self.sites.offset**2])
         site = -0.5 * (used * jnp.log(2 * np.pi * sd**2) + square / sd**2)
-        return _Found(belief.mean, belief.covariance, belief.evidence(site), jnp.zeros_like(sd))
+        return Posterior(belief.mean, belief.covariance, belief.evidence(site), jnp.zeros_like(sd))
 
     def swept(
         self, family: Array, sd: Float[Array, " batch"], state: _Propagation, sweeps: int
-    ) -> tuple[_Propagation, _Found]:
+    ) -> tuple[_Propagation, Posterior]:
         """Take ``sweeps`` sweeps under a law; the evidence is that before the last one."""
 
         def sweep(_: Array, carry: tuple) -> tuple:
@@ -378,7 +358,7 @@ class _Laws(eqx.Module):
 
         none = jnp.zeros_like(sd)
         state, (evidence, change) = jax.lax.fori_loop(0, sweeps, sweep, (state, (none, none)))
-        return state, _Found(state.belief.mean, state.belief.covariance, evidence, change)
+        return state, Posterior(state.belief.mean, state.belief.covariance, evidence, change)
 
     def sweep(
         self, family: Array, sd: Float[Array, " batch"], state: _Propagation
