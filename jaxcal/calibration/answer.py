@@ -45,7 +45,7 @@ from jaxcal.result.calibration import Calibration, Linearisation, Medium, Status
 from jaxcal.solvers.convergence import Convergence
 from jaxcal.solvers.dense import inverse_batch_last
 from jaxcal.solvers.methods import Solution
-from jaxcal.solvers.normal_equations import accumulate, information_and_design
+from jaxcal.solvers.normal_equations import accumulate, component_sums, stacked
 from jaxcal.solvers.plan import Given, SolvePlan
 
 LEAST_GAP_MM = 1e-6
@@ -168,7 +168,8 @@ def _normal_matrices(
     observation, iterate = found.observation, found.iterate
     geometry = observation.geometry(images, iterate.blocks)
     if geometry is observation and observation.whitened:
-        return information_and_design(iterate, observation, images, found.medium)
+        sums = component_sums(iterate, observation, images, None, found.medium)
+        return sums.weighted(1 / observation.sigma**2).stacked(), stacked(jnp.sum(sums.matrix, 0))
     weighted = accumulate(iterate, observation, images, None, found.medium).stacked()
     if geometry is observation:
         return weighted, weighted

@@ -451,39 +451,6 @@ def accumulate(
     return NormalEquations(unrolled.as_array(flat), unrolled.as_array(gradient), cost, lengths)
 
 
-def information_and_design(
-    iterate: Iterate,
-    observation: Observation,
-    images: ImagePlanes,
-    medium: MediumPrior | None = None,
-) -> tuple[Float[Array, "p p batch"], Float[Array, "p p batch"]]:
-    """Gauss-Newton's matrix, and that of the unweighted residuals, in one pass.
-
-    Args:
-        iterate: X, c and the further unknowns of every problem.
-        observation: one without an unknown in every image.
-        images: the data.
-        medium: prior of further unknowns, or None.
-    """
-    q, tracker_to_image = targets(iterate, images)
-    derived = _derive(observation, q, tracker_to_image, iterate, images, exact=False)
-    curvatures = [
-        _gauss_newton(derived, k, images).curvature for k in range(len(derived.components))
-    ]
-    planes: Vector = []
-    for weights in ([(1 / (sd * sd))[:, None] for sd in observation.sigma], [1] * len(curvatures)):
-        curvature = _summed(curvatures, weights)
-        term = Term(0, [0] * len(curvature), curvature)
-        planes += contributions(q, tracker_to_image, term, derived.unknowns, 0)[0]
-    sums = total(planes)
-    flat, design = sums[: len(sums) // 2], sums[len(sums) // 2 :]
-    if medium is not None:
-        indices = diagonal_indices(iterate.unknowns)
-        for k, _, precision in medium.deviations(iterate):
-            flat[indices[k]] = flat[indices[k]] + precision
-    return stacked(unrolled.as_array(flat)), stacked(unrolled.as_array(design))
-
-
 class ComponentSums(eqx.Module):
     """Sums of one pass over the images for each component separately, unweighted; batch axis last.
 
