@@ -19,7 +19,7 @@ from scipy.stats import multivariate_normal, norm, t, uniform
 import jaxcal
 from jaxcal import InputError
 from jaxcal.diagnostics.intervals import degrees_of_freedom
-from jaxcal.diagnostics.law_words import offset_law
+from jaxcal.diagnostics.offset_fit import offset_law
 from jaxcal.model.distributions import FAMILIES, UNIFORM
 from jaxcal.model.shapes import tilted
 from jaxcal.solvers.auto import Answers, median, weights

@@ -7,8 +7,13 @@ import pytest
 from scipy import stats
 
 import jaxcal
-from jaxcal.diagnostics.law_words import _law_in_words, offset_law
-from jaxcal.diagnostics.offset_fit import CONTRADICTED, contradicted, distribution
+from jaxcal.diagnostics.offset_fit import (
+    CONTRADICTED,
+    _law_in_words,
+    contradicted,
+    distribution,
+    offset_law,
+)
 from jaxcal.model.distributions import FAMILIES
 
 DRAWN = {

@@ -6,7 +6,7 @@
     unmodelled       errors that the model leaves out and that the residuals show
     outlier_agreement   whether the images left out agree on another calibration
     summary          all of these for a calibration or a batch
-    directions, law_words, misfits, outliers   the same in words
+    directions, misfits, outliers, offset_fit   the same in words
     warnings         everything that a person should know before using an answer
     intervals        confidence intervals and target registration error
     metrics          reconstruction precision, reproducibility

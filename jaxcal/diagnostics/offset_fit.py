@@ -1,4 +1,4 @@
-"""Do the offsets follow the laws that were weighed? A test of fit for each.
+"""Do the offsets follow the laws that were weighed? A test of fit for each, and words.
 
 The probability of a law (:mod:`jaxcal.solvers.auto`) is relative to the others: if all the laws are
 wrong, one still fits best. A law may also be excluded by a detail: if a single image oversteps the
@@ -14,16 +14,29 @@ References: Lilliefors 1967 (estimated parameters); the limits are from 4,000 si
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jaxcal.diagnostics.residual_checks import FEWEST_TO_CHECK
+from jaxcal.model.distributions import FAMILIES
 from jaxcal.runtime.array_types import Float
+
+if TYPE_CHECKING:
+    from jaxcal.result.calibration import Calibration
 
 CONTRADICTED: dict[str, float] = {"uniform": 1.25, "bell": 1.25, "gaussian": 1.25, "student": 1.9}
 """The largest sqrt(n) D for each family of :data:`jaxcal.model.distributions.FAMILIES`."""
 
 MEDIAN_OF_STUDENT = 0.5237
 """Median magnitude of Student's t4, divided by its SD."""
+
+_FAMILY = {
+    "uniform": "uniform with sharp limits",
+    "bell": "bell-shaped with sharp limits",
+    "gaussian": "Gaussian",
+    "student": "heavy-tailed",
+}
 
 
 def law_distances(offsets: Float[np.ndarray, " n"]) -> dict[str, float]:
@@ -39,13 +52,8 @@ def law_distances(offsets: Float[np.ndarray, " n"]) -> dict[str, float]:
     middle = np.median(np.abs(centred - np.median(centred))) / MEDIAN_OF_STUDENT
     below, above = np.arange(count) / count, np.arange(1, count + 1) / count
     found = {}
-    for family, size in (
-        ("uniform", spread),
-        ("bell", spread),
-        ("gaussian", spread),
-        ("student", middle),
-    ):
-        expected = distribution(family, centred / size)
+    for family in FAMILIES:
+        expected = distribution(family, centred / (middle if family == "student" else spread))
         apart = np.maximum(expected - below, above - expected).max()
         found[family] = float(np.sqrt(count) * apart)
     return found
@@ -70,3 +78,61 @@ def distribution(family: str, u: Float[np.ndarray, " n"]) -> Float[np.ndarray, "
     t = u * 2**0.5
     share = t / np.sqrt(4 + t**2)
     return 0.5 + 0.75 * (share - share**3 / 3)
+
+
+def offset_law(result: Calibration) -> dict[str, object] | None:
+    """What the data say about the offsets' law and the noise, as plain values and in words."""
+    law = result.offset_law
+    if law is None:
+        return None
+    weighed = bool(law.weighed)
+    probability = {
+        family: float(value) for family, value in zip(FAMILIES, law.probability, strict=True)
+    }
+    own = float(law.own_probability)
+    mean_probability = float(law.mean_probability)
+    words, wrong = (
+        "The distributions of the offsets could not be compared; Gaussian is assumed",
+        None,
+    )
+    if weighed:
+        wrong = _contradicted(result)
+        words = _law_in_words(probability, wrong)
+        if mean_probability > 0.5:
+            words += f", about a mean of {float(law.mean):.2f} +- {float(law.mean_sd):.2f} mm"
+        noise = "each image's own covariance" if own > 0.5 else "the same SDs in all images"
+        words += f". The measurement errors are weighted by {noise}"
+    words += "."
+    return {
+        "weighed": weighed,
+        "probability": probability if weighed else None,
+        "contradicted": wrong,
+        "mean_mm": float(law.mean),
+        "mean_sd_mm": float(law.mean_sd),
+        "mean_probability": mean_probability,
+        "own_covariances_probability": own,
+        "words": words,
+    }
+
+
+def _contradicted(result: Calibration) -> list[str]:
+    """The laws that the estimated offsets do not follow; none are tested with few images."""
+    offsets = np.asarray(result.elevation, dtype=float)[np.asarray(result.mask) > 0]
+    if len(offsets) < FEWEST_TO_CHECK or not np.std(offsets) > 0:
+        return []
+    return [family for family, wrong in contradicted(offsets).items() if wrong]
+
+
+def _law_in_words(probability: dict[str, float], wrong: list[str]) -> str:
+    ranked = sorted(probability.items(), key=lambda item: -item[1])
+    named = [(name, p) for name, p in ranked if p >= 0.1]
+    told = " or ".join(f"{_FAMILY[name]} ({100 * p:.0f} %)" for name, p in named)
+    if not wrong or any(name not in wrong for name, _ in named):
+        return f"Of the distributions of the offsets that were compared, the data prefer: {told}"
+    fitting = [words for name, words in _FAMILY.items() if name not in wrong]
+    if not fitting:
+        return f"None of the distributions compared fits the offsets; the least bad is {told}"
+    return (
+        f"The estimate assumes offsets that are {told}, but the estimated offsets look "
+        f"{' or '.join(fitting)}"
+    )

@@ -12,9 +12,9 @@ from jaxcal import InputError
 from jaxcal.data.poses import rotation_angle
 from jaxcal.data.recording import Images, Recording, Truth
 from jaxcal.diagnostics.intervals import beside_scale
-from jaxcal.diagnostics.law_words import offset_law
 from jaxcal.diagnostics.metrics import reconstruct, reconstruction_precision
 from jaxcal.diagnostics.misfits import noise_model
+from jaxcal.diagnostics.offset_fit import offset_law
 from jaxcal.diagnostics.outliers import outlier_reasons, outliers, suspects
 from jaxcal.model.unknowns import (
     TABLE,
