@@ -11,7 +11,7 @@ from common import arguments, machine, show, write_table
 from pose_design import CONES, COUNTS, POOL, SEED, planned, pool
 
 from jaxcal import design
-from jaxcal.design.predict import curve
+from jaxcal.design.criteria import curve
 from jaxcal.runtime.jax_cache import enable_compilation_cache
 
 RANDOM = 400

@@ -16,7 +16,7 @@ from pose_design import CONES, POOL, SEED, pool
 
 import jaxcal
 from jaxcal import design
-from jaxcal.design.predict import curve
+from jaxcal.design.criteria import curve
 from jaxcal.runtime.jax_cache import enable_compilation_cache
 
 HEADER = [

@@ -28,7 +28,7 @@ from pose_design import (
 )
 
 from jaxcal import design
-from jaxcal.design.predict import curve
+from jaxcal.design.criteria import curve
 from jaxcal.runtime.jax_cache import enable_compilation_cache
 
 SIMULATED = 4000

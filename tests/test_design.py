@@ -22,10 +22,9 @@ from jaxcal.data import geometry
 from jaxcal.data.recording import Recording, make_images
 from jaxcal.design import Constraints, Model, Noise, Region
 from jaxcal.design.candidates import seen_region, sobol_poses, sobol_sequence
-from jaxcal.design.criteria import check_criterion, gains, rp_weight, tre_weight, weight_of
+from jaxcal.design.criteria import check_criterion, curve, gains, rp_weight, tre_weight, weight_of
 from jaxcal.design.greedy import Rules, are_alike
 from jaxcal.design.information import Known, covariance_of, known_information
-from jaxcal.design.predict import curve
 from jaxcal.diagnostics.sd_by_place import basis_at, log_sd_slopes
 
 MOUNT = np.eye(4)

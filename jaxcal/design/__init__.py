@@ -7,14 +7,13 @@ the squared target registration error and the squared reconstruction precision a
 constraints.py  where a pose may be: image region, cone, turn, box, reach
 noise.py        SDs as functions of where the target is in the image
 information.py  G of a pose; the information of a calibration
-criteria.py     W of TRE and RP; the gain of a pose in closed form
+criteria.py     W of TRE and RP; the gain of a pose in closed form; predicted errors
 candidates.py   poses to choose from: for a probe and a region, or around a recording
 greedy.py       chooses one pose after the other
 exchange.py     exchanges each chosen pose for the best candidate
 polish.py       moves poses along the gradient on SE(3), inside the constraints
 planning.py     plan, next_poses
 bound.py        an error that no choice among the candidates can go below
-predict.py      predicted errors of a plan
 count.py        images_to: how many images a wanted error takes; plan_until: so many poses
 simulated.py    errors of many simulated calibrations at given poses
 words.py        a pose in words, for a person who holds the probe

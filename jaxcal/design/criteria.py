@@ -1,4 +1,4 @@
-"""The criteria of a plan: the weight matrices W, and the gain of a further pose.
+"""The criteria of a plan: the weight matrices W, the gain of a further pose, predicted errors.
 
 TRE. At an image point p the error of X Exp(d) p is J_p d with J_p = [I, -[p]x] (mm); unknown pixel
 scales add two columns (:mod:`jaxcal.model.image_points`). So the mean square over an image
@@ -15,6 +15,10 @@ Gain. With G of one more pose, A = G S G' and Woodbury's identity, tr(W S) falls
 
 and ln det S by ln det(I + A): matrices of 3x3.
 
+Predicted errors (:func:`curve`) are the Cramer-Rao bound under the model's SDs. After a
+calibration, whose SDs were tuned to its images, it is multiplied by Student's factor, as the errors
+that the calibration itself states are (:mod:`jaxcal.diagnostics.intervals`).
+
 SDs that are not tuned to data may be wrong. The criterion is then the mean of ln tr(W S) over a few
 sets of SDs (:func:`hypotheses`); only the ratios of the SDs matter.
 """
@@ -27,9 +31,10 @@ import numpy as np
 
 from jaxcal import InputError
 from jaxcal.design.candidates import Candidates
-from jaxcal.design.information import Model
+from jaxcal.design.information import Known, Model, covariance_of
+from jaxcal.diagnostics.intervals import student_variance
 from jaxcal.model.image_points import mean_of_squares, point_jacobian
-from jaxcal.runtime.array_types import AnyArray, Array, Float
+from jaxcal.runtime.array_types import AnyArray, Array, Float, Int
 from jaxcal.runtime.given_values import check_made
 
 Criterion = Literal["tre", "rp", "d"]
@@ -174,3 +179,27 @@ def _adjugate(
         ]
     )
     return a11 * adjugate[0] + a12 * adjugate[5] + a13 * adjugate[4], adjugate
+
+
+def tuned_factor(known: Known, more: Int[np.ndarray, "*n"], size: int) -> Float[np.ndarray, "*n"]:
+    """By how much squared errors with so many more images exceed the bound: 1 for given SDs."""
+    left = known.images + more - size / 3
+    return np.asarray(student_variance(left if known.tuned else np.full_like(left, np.inf)))
+
+
+def curve(
+    candidates: Candidates, known: Known, poses: Float[np.ndarray, "n 4 4"]
+) -> tuple[Float[np.ndarray, " n1"], Float[np.ndarray, " n1"]]:
+    """Predicted TRE and RP with the first 0, 1, ... n of the poses, mm."""
+    model = candidates.model
+    rows = model.jacobian(poses)
+    steps = np.einsum("nia,nib->nab", rows, rows)
+    total = known.information + np.concatenate([np.zeros((1, *steps.shape[1:])), steps.cumsum(0)])
+    covariance = covariance_of(total)
+    weights = (
+        tre_weight(candidates.constraints.region.grid(), model),
+        rp_weight(candidates.poses, model),
+    )
+    factor = tuned_factor(known, np.arange(len(total)), model.size)
+    tre, rp = (np.sqrt(factor * np.einsum("ab,nab->n", weight, covariance)) for weight in weights)
+    return tre, rp

@@ -13,6 +13,7 @@ from jaxcal.design.candidates import Candidates
 from jaxcal.design.criteria import (
     Criterion,
     check_criterion,
+    curve,
     hypotheses,
     tre_weight,
     weight_of,
@@ -27,7 +28,6 @@ from jaxcal.design.information import (
     known_information,
 )
 from jaxcal.design.noise import SD_RANGE_MM, Noise, check_result
-from jaxcal.design.predict import curve
 from jaxcal.diagnostics.directions import direction_in_words
 from jaxcal.runtime.array_types import Bool, Float
 from jaxcal.runtime.given_values import check_flag, check_made, real_array, whole_number

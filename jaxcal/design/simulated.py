@@ -1,9 +1,9 @@
 """Simulated errors of poses: what calibrations of such images turn out to be.
 
-:mod:`jaxcal.design.predict` predicts errors in closed form from SDs alone. What a method really
-makes of few images, or of offsets with edges, a mean or long tails, is not in a formula. It is in
-many simulated recordings: the target is seen from the given poses, elevational offsets follow a
-law, lateral position and range err by the model's SDs, and every recording is calibrated.
+:func:`jaxcal.design.criteria.curve` predicts errors in closed form from SDs alone. What a method
+really makes of few images, or of offsets with edges, a mean or long tails, is not in a formula. It
+is in many simulated recordings: the target is seen from the given poses, elevational offsets follow
+a law, lateral position and range err by the model's SDs, and every recording is calibrated.
 """
 
 from __future__ import annotations
