@@ -101,14 +101,6 @@ class Candidates:
         return self.constraints.coordinates(self.poses, model.image_to_probe, model.point)
 
 
-def sobol_numbers(count: int, constraints: Constraints, seed: int) -> Float[np.ndarray, "n 5"]:
-    """The first ``count`` points of the sequence (rounded up to a power of two)."""
-    draws = sobol_sequence(1 << int(np.ceil(np.log2(max(count, 2)))))
-    # Sobol points are balanced in powers of two; a shift modulo 1 keeps them uniform.
-    fraction = (draws + np.random.default_rng(seed).random(5)) % 1.0
-    return numbers_of(fraction, constraints)
-
-
 def sobol_sequence(count: int) -> Float[np.ndarray, "n 5"]:
     """The first points of Sobol's sequence in the unit cube, the same as in ``scipy.stats.qmc``.
 
@@ -132,19 +124,21 @@ def sobol_sequence(count: int) -> Float[np.ndarray, "n 5"]:
     return found / 2.0**SOBOL_BITS
 
 
-def numbers_of(
-    fraction: Float[np.ndarray, "n 5"], constraints: Constraints
-) -> Float[np.ndarray, "n 5"]:
-    """The five numbers for points of the unit cube (tilt, azimuth, turn, lateral, depth)."""
-    tilt = np.arccos(1 - fraction[:, 0] * (1 - np.cos(np.radians(constraints.cone_deg))))
-    azimuth = 2 * np.pi * fraction[:, 1]
+def sobol_numbers(count: int, constraints: Constraints, seed: int) -> Float[np.ndarray, "n 5"]:
+    """The first ``count`` points of the sequence (rounded up to a power of two), as numbers."""
+    draws = sobol_sequence(1 << int(np.ceil(np.log2(max(count, 2)))))
+    # Sobol points are balanced in powers of two; a shift modulo 1 keeps them uniform.
+    shifted = (draws + np.random.default_rng(seed).random(5)) % 1.0
+    height, round_, turn, lateral, depth = shifted.T
+    tilt = np.arccos(1 - height * (1 - np.cos(np.radians(constraints.cone_deg))))
+    azimuth = 2 * np.pi * round_
     return np.column_stack(
         [
-            2 * fraction[:, 3] - 1,
-            2 * fraction[:, 4] - 1,
+            2 * lateral - 1,
+            2 * depth - 1,
             tilt * np.cos(azimuth),
             tilt * np.sin(azimuth),
-            np.radians(constraints.turn_deg) * (2 * fraction[:, 2] - 1),
+            np.radians(constraints.turn_deg) * (2 * turn - 1),
         ]
     )
 
