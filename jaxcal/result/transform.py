@@ -206,7 +206,7 @@ class ImageTransform:
                 return None
             # X' = X T with T a shift by d along lateral moves the perturbation to the new origin.
             adjoint = np.eye(len(covariance))
-            adjoint[:3, 3:6] = -_cross(np.array([-scale[0] * origin[0], 0.0, 0.0]))
+            adjoint[1, 5], adjoint[2, 4] = -scale[0] * origin[0], scale[0] * origin[0]
             return adjoint @ covariance @ adjoint.T
 
         return replace(
@@ -249,7 +249,7 @@ class ImageTransform:
         plane = self._in_plane(pixels)
         count, rotation = len(plane), self.image_plane_to_probe[:3, :3]
         points = plane @ rotation.T + self.image_plane_to_probe[:3, 3]
-        factor = self._error_factor(plane)
+        factor = self.error_factor(pixels)
         spread = np.zeros(3)
         spread[[0, 2]] = own * self._mm_per_px()
         covariance = factor @ factor.swapaxes(1, 2) + rotation @ np.diag(spread**2) @ rotation.T
@@ -276,7 +276,16 @@ class ImageTransform:
         Raises:
             InputError: as :meth:`apply`.
         """
-        return self._error_factor(self._in_plane(pixels))
+        plane = self._in_plane(pixels)
+        covariance, blocks = self.image_covariance, self.unknowns
+        if covariance is None:
+            covariance, blocks = self.covariance, ("translation", "rotation")
+        if covariance is None:
+            return np.full((len(plane), 3, 6), np.nan)
+        values, vectors = np.linalg.eigh(covariance)
+        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        jacobian = point_jacobian(plane[:, [0, 2]], blocks, self.face_offset_mm, self.range_factor)
+        return self.image_plane_to_probe[:3, :3] @ jacobian @ root
 
     def _mm_per_px(self) -> Float[np.ndarray, 2]:
         """Size of a pixel at the estimated sound speed; 1 across where points are in mm."""
@@ -295,18 +304,6 @@ class ImageTransform:
         plane = np.zeros((len(measured), 3))
         plane[:, [0, 2]] = self._mm_per_px() * measured + np.array([0.0, self.face_offset_mm])
         return plane
-
-    def _error_factor(self, plane: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 q"]:
-        """R J C^1/2; J is :mod:`jaxcal.model.image_points`'."""
-        covariance, blocks = self.image_covariance, self.unknowns
-        if covariance is None:
-            covariance, blocks = self.covariance, ("translation", "rotation")
-        if covariance is None:
-            return np.full((len(plane), 3, 6), np.nan)
-        values, vectors = np.linalg.eigh(covariance)
-        root = vectors * np.sqrt(np.maximum(values, 0.0))
-        jacobian = point_jacobian(plane[:, [0, 2]], blocks, self.face_offset_mm, self.range_factor)
-        return self.image_plane_to_probe[:3, :3] @ jacobian @ root
 
     def _scale(self) -> Float[np.ndarray, 2]:
         if self.scale_mm_per_px is None:
@@ -404,11 +401,6 @@ def _is_symmetric(covariance: Float[np.ndarray, "q q"]) -> bool:
     """Whether a covariance is symmetric as far as its SDs matter."""
     sd = np.sqrt(np.diag(covariance))
     return bool((np.abs(covariance - covariance.T) <= _UNEQUAL * np.outer(sd, sd)).all())
-
-
-def _cross(vector: np.ndarray) -> Float[np.ndarray, "3 3"]:
-    x, y, z = vector
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def transform_from_plus_matrix(
