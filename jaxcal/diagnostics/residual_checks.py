@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jaxcal.data.poses import rotations_from_vectors
 from jaxcal.diagnostics.image_errors import (
     ImageErrors,
     Whitened,
@@ -300,17 +301,5 @@ def gains(answer: Calibration, seen: ImageErrors, uncertainty: Uncertainty) -> F
     return noticed.reshape(-1, 5, 2).max(axis=2)
 
 
-def _tilts() -> Float[Array, "6 3 3"]:
-    """Transposes of the rotations by the tilt, either way about each image axis."""
-    found = []
-    for axis in range(3):
-        first, second = (axis + 1) % 3, (axis + 2) % 3
-        for sine in (np.sin(TILT_RAD), -np.sin(TILT_RAD)):
-            turn = np.eye(3)
-            turn[first, first] = turn[second, second] = np.cos(TILT_RAD)
-            turn[first, second], turn[second, first] = sine, -sine
-            found.append(turn)
-    return np.array(found)
-
-
-_TILTS = _tilts()
+_TILTS = rotations_from_vectors(np.kron(np.eye(3), [[-TILT_RAD], [TILT_RAD]]))
+"""Transposes of the rotations by the tilt, either way about each image axis."""
