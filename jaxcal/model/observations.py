@@ -604,10 +604,6 @@ class MediumPrior(eqx.Module):
     sd: Float[Array, "k batch"]
     blocks: Blocks = eqx.field(static=True)
 
-    def repeated(self, times: int) -> MediumPrior:
-        """The same, the whole batch ``times`` times over."""
-        return MediumPrior(jnp.tile(self.sd, (1, times)), self.blocks)
-
     def deviations(self, iterate: Iterate) -> list[tuple[int, Array, Array]]:
         """Index, deviation from nominal and precision of every component that has a prior."""
         found = []

@@ -116,23 +116,15 @@ def average_over_laws(
     model = Linearised.of(common, common.sigma)
     sites = sites_at(model, images, bound)
     answers = answers_under(model, sites, shapes)
-    own = jnp.zeros_like(used)
+    own, sigma = jnp.zeros_like(used), model.sigma
     if variances is not None and isinstance(observation, Points):
         other, more_probable = with_own_covariances(common, observation, images, variances, medium)
         own = jax.nn.sigmoid(more_probable)
         beside = answers_under(other, sites_at(other, images, bound), shapes)
-        step = model.iterate.step_to(other.iterate)
-        answers = Answers.joined(
-            answers.shared(1 - own),
-            beside.seen_from(model.iterate.step_to(other.iterate), other.mean - model.mean).shared(
-                own
-            ),
-        )
-        sigma = choose(own > 0.5, other.sigma, model.sigma)
-    else:
-        sigma = model.sigma
-    step, covariance = median(answers, model.offsets_metric())
-    step, covariance = barrier((step, covariance))
+        beside = beside.seen_from(model.iterate.step_to(other.iterate), other.mean - model.mean)
+        answers = Answers.joined(answers.shared(1 - own), beside.shared(own))
+        sigma = choose(own > 0.5, other.sigma, sigma)
+    step, covariance = barrier(median(answers, model.offsets_metric()))
 
     at = np.array(SITE_UNKNOWNS)
     variance = sites.variance(covariance[at[:, None], at])
