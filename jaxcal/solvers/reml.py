@@ -187,8 +187,7 @@ class Proposal(eqx.Module):
         updated: the SDs after one update at the iterate, mm.
         exact: 1 where exact second derivatives were used.
         indefinite: the matrix was indefinite, and the step is zero.
-        half_cost: half the cost at the iterate, with ``step_sigma``.
-        predicted: predicted decrease of ``half_cost``.
+        predicted: predicted decrease of half the cost with ``step_sigma``.
     """
 
     move: Float[Array, "p batch"]
@@ -197,7 +196,6 @@ class Proposal(eqx.Module):
     updated: Float[Array, "k batch"]
     exact: Float[Array, " batch"]
     indefinite: Bool[Array, " batch"]
-    half_cost: Float[Array, " batch"]
     predicted: Float[Array, " batch"]
 
 
@@ -261,47 +259,38 @@ class Tuning(eqx.Module):
     sigma_tolerance: float = eqx.field(static=True)
     max_rounds: int = eqx.field(static=True)
 
-    def update(
-        self, sums: ComponentSums, sigma: Array, damping: Array, exact: Array
-    ) -> tuple[Array, Array, Array, Array]:
-        """The step for given SDs, its predicted decrease, the SDs after it; where there is no step.
-
-        The step is zero where the matrix is indefinite.
-        """
-        normal = sums.weighted(1 / sigma**2)
-        curved = NormalEquations(
-            normal.curvature + exact * sums.rest, normal.gradient, normal.cost, normal.diagonal()
-        )
-        move, predicted, indefinite = damped_step(curved, damping)
-        after = barrier(updated(sums, normal, sigma, move, self.count))
-        tuned = jnp.where(jnp.isfinite(after), after, sigma)
-        return move, predicted, jnp.where(self.enough, tuned, self.fallback), indefinite
-
     def propose(self, sums: ComponentSums, sigma: Array, damping: Array, exact: Array) -> Proposal:
         """From the sums at an iterate, a few updates of the SDs and the step for the new SDs."""
 
         def again(carry: tuple) -> tuple:
-            count, sigma, _, _, _, first, exact, _ = carry
-            move, predicted, after, indefinite = self.update(sums, sigma, damping, exact)
-            first = jnp.where(count == 0, after, first)
-            exact = jnp.where(indefinite, 0.0, exact)
-            return count + 1, after, sigma, move, predicted, first, exact, indefinite
+            count, before = carry
+            sigma, exact = before.sigma, before.exact
+            normal = sums.weighted(1 / sigma**2)
+            curved = NormalEquations(
+                normal.curvature + exact * sums.rest,
+                normal.gradient,
+                normal.cost,
+                normal.diagonal(),
+            )
+            move, predicted, indefinite = damped_step(curved, damping)
+            after = barrier(updated(sums, normal, sigma, move, self.count))
+            tuned = jnp.where(jnp.isfinite(after), after, sigma)
+            after = jnp.where(self.enough, tuned, self.fallback)
+            found = Proposal(
+                move=move,
+                sigma=after,
+                step_sigma=sigma,
+                updated=jnp.where(count == 0, after, before.updated),
+                exact=jnp.where(indefinite, 0.0, exact),
+                indefinite=indefinite,
+                predicted=predicted,
+            )
+            return count + 1, found
 
         none = jnp.zeros_like(sums.gradient[0])
-        zero = jnp.zeros((), jnp.int32)
-        carry = (zero, sigma, sigma, none, none[0], sigma, exact, exact > 1)
-        carry = jax.lax.while_loop(lambda carry: carry[0] < UPDATES, again, carry)
-        _, after, step_sigma, move, predicted, first, exact, indefinite = carry
-        return Proposal(
-            move=move,
-            sigma=after,
-            step_sigma=step_sigma,
-            updated=first,
-            exact=exact,
-            indefinite=indefinite,
-            half_cost=0.5 * sums.weighted(1 / step_sigma**2).cost,
-            predicted=predicted,
-        )
+        begun = Proposal(none, sigma, sigma, sigma, exact, exact > 1, none[0])
+        carry = (jnp.zeros((), jnp.int32), begun)
+        return jax.lax.while_loop(lambda carry: carry[0] < UPDATES, again, carry)[1]
 
     def judge(self, state: SelfTuned, sums: ComponentSums, rounding: Rounding) -> StepJudgement:
         """Whether the step to the candidate is accepted."""
@@ -342,22 +331,8 @@ class Tuning(eqx.Module):
         )
         # Where the candidate is refused, the proposal from its sums is not used.
         exact = jnp.where(cosine <= EXACT_BELOW, 1.0, 0.0).astype(self.coordinates.dtype)
-        found = self.propose(sums, sigma, judged.damping, exact)
-        new = self.next_state(state, judged, found, iterate, sigma, cost, cosine)
-        return choose(state.active, new, state)
-
-    def next_state(
-        self,
-        state: SelfTuned,
-        judged: StepJudgement,
-        found: Proposal,
-        iterate: Iterate,
-        sigma: Float[Array, "k batch"],
-        cost: Float[Array, " batch"],
-        cosine: Float[Array, " batch"],
-    ) -> SelfTuned:
-        """The state after a pass, with the best iterate so far and what was proposed from there."""
         accept, damping, stalled = judged.accept, judged.damping, judged.stalled
+        found = self.propose(sums, sigma, damping, exact)
         change = jnp.max(jnp.abs(jnp.log(found.updated / sigma)), axis=0)
         change = jnp.where(accept, change, state.change)
         there = (cosine <= self.cosine_tolerance) | (stalled >= MOST_STALLED)
@@ -368,7 +343,7 @@ class Tuning(eqx.Module):
         given_up = (damping > LARGEST_DAMPING) | (iterations >= self.max_rounds)
         given_up = given_up | jnp.logical_not(jnp.isfinite(cost))
         retry = found.indefinite | jnp.logical_not(accept)
-        return SelfTuned(
+        new = SelfTuned(
             iterate=iterate,
             sigma=sigma,
             updated=jnp.where(accept, found.updated, state.updated),
@@ -380,7 +355,7 @@ class Tuning(eqx.Module):
             units=state.proposed,
             retry=retry,
             step_sigma=found.step_sigma,
-            half_cost=found.half_cost,
+            half_cost=0.5 * sums.weighted(1 / found.step_sigma**2).cost,
             predicted=found.predicted,
             exact_used=found.exact,
             damping=damping,
@@ -390,6 +365,7 @@ class Tuning(eqx.Module):
             active=jnp.logical_not(done | given_up),
             trace=recorded(state.trace, state.iterations, cost),
         )
+        return choose(state.active, new, state)
 
 
 def self_tuned(
