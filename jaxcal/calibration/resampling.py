@@ -39,6 +39,7 @@ from jaxcal.model.observations import factor_of
 from jaxcal.model.parameters import Parameters
 from jaxcal.model.residuals import measured_points, measurement_residual
 from jaxcal.model.thresholds import MAD
+from jaxcal.model.unknowns import split_further
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.arrays import each_image, is_traced
 from jaxcal.runtime.given_values import LARGEST_SEED, check_key, check_made, whole_number
@@ -138,7 +139,7 @@ def cross_validate(
         InputError: too few images, folds that are not from 2 to the number of images, options that
             contradict each other, or a result by another method than they ask for.
     """
-    problem, plan = _one_problem(problem, arguments, "jaxcal.cross_validate")
+    problem, plan, arguments = _one_problem(problem, arguments, "jaxcal.cross_validate")
     count = problem.images
     folds = count if folds is None else whole_number("folds", folds, 2, count)
     result = _full_calibration(problem, result, plan, arguments)
@@ -146,7 +147,10 @@ def cross_validate(
     fold = np.arange(count) % folds
     rest = jnp.asarray(fold[None, :] != np.arange(folds)[:, None], problem.mask.dtype)
     _check_remaining(problem.mask, rest)
-    fits = calibrate_batch(_with_masks(problem, problem.mask * rest), **_for_resamples(arguments))
+    many = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (folds, *leaf.shape)), problem)
+    # Outliers were found with all images.
+    arguments["robust"] = False
+    fits = calibrate_batch(replace(many, mask=problem.mask * rest), **arguments)
     return _compared(problem, result, fits, fold)
 
 
@@ -210,7 +214,7 @@ def bootstrap(
         InputError: fewer than 2 resamples, options that contradict each other, or a result by
             another method than they ask for.
     """
-    problem, plan = _one_problem(problem, arguments, "jaxcal.bootstrap")
+    problem, plan, arguments = _one_problem(problem, arguments, "jaxcal.bootstrap")
     resamples = whole_number("resamples", resamples, 2, LARGEST_RESAMPLES)
     if isinstance(key, jax.Array):
         check_key("key", key)
@@ -222,7 +226,8 @@ def bootstrap(
     problem = replace(problem, mask=mask)
     rows = _rows(root, mask, resamples)
     # Each draw has as many images as were used, since the mask leaves out the other rows.
-    fits = calibrate_batch(_with_rows(problem, rows, mask), **_for_resamples(arguments))
+    arguments["robust"] = False
+    fits = calibrate_batch(_with_rows(problem, rows, mask), **arguments)
     return _scatter(problem, result, fits)
 
 
@@ -315,7 +320,7 @@ def _full_calibration(
 ) -> Calibration:
     """The calibration of all images: the caller's, checked, or a new one."""
     if result is None:
-        return calibrate(problem, **_without_bounds(arguments))
+        return calibrate(problem, **arguments)
     check_made("result", result, Calibration, "jaxcal.calibrate")
     if np.shape(result.mask) != (problem.images,):
         raise InputError(
@@ -337,20 +342,10 @@ def _full_calibration(
     return result
 
 
-def _without_bounds(arguments: dict[str, Any]) -> dict[str, Any]:
-    """The arguments without the bound on the offsets, which is the problem's now."""
-    return {name: value for name, value in arguments.items() if name != "max_elevation"}
-
-
-def _for_resamples(arguments: dict[str, Any]) -> dict[str, Any]:
-    """The same for parts of the problem: outliers were found with all images."""
-    return {**_without_bounds(arguments), "robust": False}
-
-
 def _one_problem(
     problem: Problem | Recording, arguments: dict[str, Any], name: str
-) -> tuple[Problem, SolvePlan]:
-    """One problem with its bounds, and how it is solved.
+) -> tuple[Problem, SolvePlan, dict[str, Any]]:
+    """One problem with its bounds, how it is solved, and the arguments without the bounds.
 
     If its values are concrete, every pose counts once.
     """
@@ -361,11 +356,12 @@ def _one_problem(
         raise TypeError(f"{name}() got an unexpected keyword argument {argument!r}")
     estimate = unknown_names(arguments.get("estimate", ()))
     problem, plan, _ = prepare(problem, Request(**{**arguments, "estimate": estimate}), name)
+    arguments = {name: value for name, value in arguments.items() if name != "max_elevation"}
     if any(is_traced(leaf) for leaf in jax.tree.leaves(problem)):
-        return problem, plan
+        return problem, plan, arguments
     alone = independent(problem, estimate)[0]
     # If JAX's 64 bits are off, a problem holds numpy arrays, which a traced index cannot index.
-    return jax.tree.map(jnp.asarray, alone), plan
+    return jax.tree.map(jnp.asarray, alone), plan, arguments
 
 
 def _check_remaining(mask: Array, rest: Array) -> None:
@@ -379,13 +375,6 @@ def _check_remaining(mask: Array, rest: Array) -> None:
         )
 
 
-def _with_masks(problem: Problem, masks: Float[Array, "k n"]) -> Problem:
-    """The same problem under many masks."""
-    count = masks.shape[0]
-    many = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), problem)
-    return replace(many, mask=masks)
-
-
 def _with_rows(problem: Problem, rows: Array, mask: Float[Array, " n"]) -> Problem:
     """The problem with other rows of images in each of k copies."""
 
@@ -396,27 +385,21 @@ def _with_rows(problem: Problem, rows: Array, mask: Float[Array, " n"]) -> Probl
     return jax.vmap(drawn)(rows)
 
 
-def _parameters(result: Calibration, problem: Problem) -> Parameters:
-    """The unknowns of a calibration of a problem, as the model has them."""
-    matrix = jnp.asarray(result.image_to_probe)
-    scale = None
-    if result.scale_mm_per_px is not None:
-        scale = jnp.asarray(result.scale_mm_per_px / problem.spacing)
-    found = Parameters.of(matrix[:3, :3], matrix[:3, 3], jnp.asarray(result.point), scale)
-    nominal = problem.nominal_sound_speed
-    if result.sound_speed_m_s is not None:
-        found = replace(found, sound_speed=result.sound_speed_m_s / nominal)
-    if result.delay_s is not None:
-        before = 0.0 if problem.delay is None else problem.delay
-        found = replace(found, delay=(result.delay_s - before) * 1e3 * nominal)
-    return found
+def _parameters(result: Calibration) -> Parameters:
+    """The unknowns of a calibration of one problem, as the model has them."""
+    matrix, values = jnp.asarray(result.image_to_probe), result.linearisation.further
+    found = Parameters.of(matrix[:3, :3], matrix[:3, 3], jnp.asarray(result.point))
+    if values is None:
+        return found
+    further = split_further(jnp.asarray(values), result.blocks)
+    return found.with_further({name: jnp.stack(parts) for name, parts in further.items()})
 
 
 def _held_out_errors(held: Calibration, problem: Problem) -> tuple[Array, Array]:
     """Errors and reconstructed target of image i through calibration i: (n, 3), (n, 3), mm."""
 
     def one(result: Calibration, image: Array) -> tuple[Array, Array]:
-        parameters = _parameters(result, problem)
+        parameters = _parameters(result)
         point = measured_points(parameters, problem)[image]
         in_image = jnp.stack([point[0], jnp.zeros_like(point[0]), point[1]])
         in_probe = parameters.rotation @ in_image + parameters.translation
@@ -459,18 +442,9 @@ def _length_in_sds(
 
 def _box_points(problem: Problem, result: Calibration) -> Float[Array, "5 2"]:
     """Corners and middle of the box that the used points fill, [lateral, axial], mm."""
-    parameters = _parameters(jax.tree.map(jnp.asarray, result), problem)
-    points = measured_points(parameters, problem)
+    points = measured_points(_parameters(result), problem)
     seen = problem.mask[:, None] > 0
     low = jnp.min(jnp.where(seen, points, jnp.inf), axis=0)
     high = jnp.max(jnp.where(seen, points, -jnp.inf), axis=0)
-    ends = jnp.stack([low, high])
-    return jnp.stack(
-        [
-            ends[0],
-            jnp.stack([high[0], low[1]]),
-            jnp.stack([low[0], high[1]]),
-            ends[1],
-            0.5 * (low + high),
-        ]
-    )
+    share = jnp.asarray([[0, 0], [1, 0], [0, 1], [1, 1], [0.5, 0.5]], low.dtype)
+    return (1 - share) * low + share * high
