@@ -9,8 +9,7 @@ noise.py        SDs as functions of where the target is in the image
 information.py  G of a pose; the information of a calibration
 criteria.py     W of TRE and RP; the gain of a pose in closed form; predicted errors
 candidates.py   poses to choose from: for a probe and a region, or around a recording
-greedy.py       chooses one pose after the other
-exchange.py     exchanges each chosen pose for the best candidate
+greedy.py       chooses one pose after the other, then exchanges each for the best candidate
 polish.py       moves poses along the gradient on SE(3), inside the constraints
 planning.py     plan, next_poses
 bound.py        an error that no choice among the candidates can go below

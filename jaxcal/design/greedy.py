@@ -1,4 +1,4 @@
-"""Greedy choice: each pose is the one that gains most in addition to those before it.
+"""Greedy choice, and exchange: each pose is the one that gains most in addition to those before it.
 
 By default every fifth pose fills space instead: it is the one that gains most among those that
 reduce the candidates' mean distance to the nearest chosen pose nearly as much as any could. The
@@ -7,6 +7,12 @@ of replicates is limited, since errors that belong to a pose (the response of th
 tracker's field) do not average out over its replicates.
 
 Cost: with m candidates and k sets of SDs, each pose takes k products of 3m x 9 with 9 x 9.
+
+*Exchange* (Fedorov 1972). The greedy choice makes each pose the best in addition to those before
+it, but not in addition to those after it. So each pose is taken out in turn and replaced by the
+best candidate, which never makes the plan worse, until nothing improves. Only a shortlist of
+candidates is tried: those that gain most at the end of the greedy plan, and an even selection of
+the rest.
 """
 
 from __future__ import annotations
@@ -29,6 +35,11 @@ MOST_POSES = 2000
 COVERING = 0.8
 """A pose fills space if it reduces the distances by at least this share of what the best one does
 (our choice)."""
+
+_PASSES = 2
+"""Largest number of passes of the exchange over all poses."""
+_SHORTLIST = 600
+_LEAST_GAIN = 1e-6
 
 
 @dataclass(frozen=True)
@@ -127,9 +138,7 @@ def are_alike(
 
 def space_features(candidates: Candidates) -> Float[np.ndarray, "m 5"]:
     """The five numbers as shares of what the constraints allow, to measure distances of poses."""
-    bounds = candidates.constraints
-    scale = np.array([1.0, 1.0, *np.radians([bounds.cone_deg] * 2), np.radians(bounds.turn_deg)])
-    return candidates.numbers / np.maximum(scale, 1e-3)
+    return candidates.numbers / np.maximum(candidates.constraints.extent, 1e-3)
 
 
 class Cover:
@@ -231,3 +240,39 @@ def choose(
         chosen.filling.append(filling)
     chosen.information = information
     return chosen
+
+
+def exchange(search: Search, chosen: Chosen) -> Chosen:
+    """Improve what greedy chose; poses that fill space stay.
+
+    Args:
+        search: candidates and what is known.
+        chosen: by :func:`choose`.
+    """
+    rows, information = list(chosen.rows), chosen.information.copy()
+    scores = search.scores(information)
+    order = np.argsort(-scores)
+    spread = order[_SHORTLIST // 2 :: max(len(order) // (_SHORTLIST // 2), 1)]
+    shortlist = np.unique(np.concatenate([order[: _SHORTLIST // 2], spread, rows]))
+    place = {row: k for k, row in enumerate(shortlist.tolist())}
+    counts = search.counts(rows)
+    for _ in range(_PASSES):
+        moved = False
+        for k, row in enumerate(rows):
+            if chosen.filling[k]:
+                continue
+            without = information - search.information_of(row)
+            value = search.scores(without, shortlist)
+            own = search.alike(search.rotations[row], search.places[row])
+            open_to = (counts - own)[shortlist] < search.rules.replicates
+            open_to[[place[other] for other in rows]] = False
+            open_to[place[row]] = True
+            best = int(shortlist[np.argmax(np.where(open_to, value, -np.inf))])
+            if best == row or value[place[best]] - value[place[row]] < _LEAST_GAIN:
+                continue
+            rows[k], moved = best, True
+            information = without + search.information_of(best)
+            counts += search.alike(search.rotations[best], search.places[best]) - own.astype(float)
+        if not moved:
+            break
+    return Chosen(rows, list(chosen.filling), information)

@@ -18,8 +18,14 @@ from jaxcal.design.criteria import (
     tre_weight,
     weight_of,
 )
-from jaxcal.design.exchange import exchange
-from jaxcal.design.greedy import MOST_POSES, Rules, Search, choose, space_features
+from jaxcal.design.greedy import (
+    MOST_POSES,
+    Rules,
+    Search,
+    choose,
+    exchange,
+    space_features,
+)
 from jaxcal.design.information import (
     Known,
     Model,
