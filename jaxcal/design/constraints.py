@@ -178,6 +178,12 @@ class Constraints:
         if self.allowed is not None and not callable(self.allowed):
             raise InputError(f"allowed must be a function of poses, not {self.allowed!r}")
 
+    @property
+    def extent(self) -> Float[np.ndarray, 5]:
+        """Largest magnitude of each of the five numbers."""
+        cone, turn = np.radians([self.cone_deg, self.turn_deg])
+        return np.array([1.0, 1.0, cone, cone, turn])
+
     def keeps(
         self,
         poses: Float[np.ndarray, "n 4 4"],

@@ -26,7 +26,7 @@ from jaxcal.runtime.jax_modes import in_own_modes
 _STEPS = 8
 _HALVINGS = 5
 _FIRST_STEP = 0.25
-"""In units of :func:`_scale`: an eighth of the full range of region, cone and turns."""
+"""In units of the extent: an eighth of the full range of region, cone and turns."""
 _LEAST_GAIN = 1e-6
 
 
@@ -81,21 +81,11 @@ def _scored(
     return jax.value_and_grad(score)(numbers)
 
 
-def _scale(candidates: Candidates) -> Float[np.ndarray, 5]:
-    bounds = candidates.constraints
-    cone, turn = np.radians([max(bounds.cone_deg, 1e-3), max(bounds.turn_deg, 1e-3)])
-    return np.array([1.0, 1.0, cone, cone, turn])
-
-
-def _cut_off(numbers: Float[np.ndarray, 5], candidates: Candidates) -> Float[np.ndarray, 5]:
+def _cut_off(numbers: Float[np.ndarray, 5], extent: Float[np.ndarray, 5]) -> Float[np.ndarray, 5]:
     """The nearest numbers inside region, cone and turn."""
-    bounds = candidates.constraints
-    inside = numbers.copy()
-    inside[:2] = np.clip(inside[:2], -1, 1)
-    tilt, cone = float(np.hypot(*inside[2:4])), np.radians(bounds.cone_deg)
-    if tilt > cone:
-        inside[2:4] *= cone / tilt
-    inside[4] = np.clip(inside[4], -np.radians(bounds.turn_deg), np.radians(bounds.turn_deg))
+    tilt, cone = float(np.hypot(*numbers[2:4])), extent[2]
+    inside = np.clip(numbers, -extent, extent)
+    inside[2:4] = numbers[2:4] * (cone / tilt if tilt > cone else 1.0)
     return inside
 
 
@@ -117,7 +107,8 @@ def polish(search: Search, candidates: Candidates, chosen: Chosen) -> Float[np.n
     rotations = search.rotations[chosen.rows].copy()
     places = search.places[chosen.rows].copy()
     information = chosen.information.copy()
-    scale = _scale(candidates)
+    # In units of the extent, of which none is zero.
+    scale = np.maximum(bounds.extent, np.radians(1e-3))
 
     def evaluate(at: np.ndarray, known: np.ndarray) -> tuple[float, np.ndarray]:
         value, slope = _scored(
@@ -153,7 +144,7 @@ def polish(search: Search, candidates: Candidates, chosen: Chosen) -> Float[np.n
         if length < 1e-9:
             return None
         for _ in range(_HALVINGS):
-            there = _cut_off(here + step * scale * direction / length, candidates)
+            there = _cut_off(here + step * scale * direction / length, bounds.extent)
             pose = bounds.poses(there[None], x, point)
             if bounds.keeps(pose, x, point)[0] and not among_too_many(k, pose[0]):
                 better, steeper = evaluate(there, known)
@@ -169,7 +160,7 @@ def polish(search: Search, candidates: Candidates, chosen: Chosen) -> Float[np.n
             continue
         own = _outer(model, poses[k], search.factors)
         known = covariance_of(information - own)
-        here = _cut_off(numbers[k], candidates)
+        here = _cut_off(numbers[k], bounds.extent)
         value, slope = evaluate(here, known)
         step = _FIRST_STEP
         for _ in range(_STEPS):
