@@ -135,7 +135,7 @@ def solve_traceable(problems: Problem, estimate: tuple[str, ...]) -> ClosedForm:
     mask = (problems.mask > 0).astype(problems.poses.dtype)
     used = problems.cleared(mask)
     points = used.measurements * used.spacing[:, None, :]
-    scaled = bool({"lateral", "common"} & set(constraints.free))
+    scaled = constraints.scaled
     if not scaled:
         face = jnp.stack([jnp.zeros_like(used.face_offset), used.face_offset], axis=1)
         points = points + face[:, None, :]

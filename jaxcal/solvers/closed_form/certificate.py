@@ -63,7 +63,7 @@ def certify(
     if transform.shape != (4, 4) or not np.isfinite(transform).all():
         raise InputError("image_to_probe must be a finite 4x4 matrix, in mm")
     factors = np.array([1.0, sound_speed_factor])
-    if {"lateral", "common"} & set(constraints.free):
+    if constraints.scaled:
         if scale_mm_per_px is None:
             raise InputError("an estimated scale belongs to the answer: give scale_mm_per_px")
         factors = real_array(scale_mm_per_px, "scale_mm_per_px") / data.spacing
@@ -74,10 +74,10 @@ def certify(
         raise InputError("image_to_probe holds no rotation: its columns are not orthonormal")
     rotation, origin = left @ right, transform[:3, 3]
     x = np.concatenate([factors[0] * rotation[:, 0], factors[1] * rotation[:, 2]])
-    if {"lateral", "common"} & set(constraints.free):
+    if constraints.scaled:
         origin = origin + data.face_offset * rotation[:, 2]
     seen = data.points.copy()
-    if not constraints.free or constraints.free == ("axial",):
+    if not constraints.scaled:
         seen[:, 1] += data.face_offset
     in_probe = seen[:, :1] * x[:3] + seen[:, 1:] * x[3:] + origin
     cloud = np.einsum("nij,nj->ni", data.rotations, in_probe) + data.translations

@@ -78,6 +78,11 @@ class QuadraticConstraints:
     values: Float[np.ndarray, " k"]
     free: tuple[str, ...]
 
+    @property
+    def scaled(self) -> bool:
+        """Whether pixel sizes are unknown; they do not stretch the range of row 0."""
+        return bool({"lateral", "common"} & set(self.free))
+
 
 def _constraints() -> dict[tuple[str, ...], QuadraticConstraints]:
     one, two = np.diag([1.0, 0.0]), np.diag([0.0, 1.0])
@@ -252,7 +257,7 @@ def reduce(data: ImageData, constraints: QuadraticConstraints) -> ReducedObjecti
     count = len(data.points)
     points = data.points.copy()
     # A sound speed multiplies the whole range, a pixel scale only what was measured in pixels.
-    if not constraints.free or constraints.free == ("axial",):
+    if not constraints.scaled:
         points[:, 1] += data.face_offset
     mean, centre = points.mean(axis=0), data.translations.mean(axis=0)
     points -= mean

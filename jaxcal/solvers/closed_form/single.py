@@ -452,24 +452,24 @@ def _assemble(
     x: Float[np.ndarray, 6], certificate: Certificate, reduced: ReducedObjective, data: ImageData
 ) -> ClosedForm:
     """The calibration that a minimiser (a1, a3) stands for."""
-    free = reduced.constraints.free
     origin, point = reduced.origin_and_target(x)
-    lateral, axial = x[:3], x[3:]
-    lengths = np.array([np.linalg.norm(lateral), np.linalg.norm(axial)])
-    r1, r3 = lateral / lengths[0], axial / lengths[1]
-    if {"lateral", "common"} & set(free):
+    pair = x.reshape(2, 3)
+    lengths = np.linalg.norm(pair, axis=1)
+    r1, r3 = pair / lengths[:, None]
+    scaled = reduced.constraints.scaled
+    if scaled:
         # The offset of the face is part of t so far.
         origin = origin - data.face_offset * r3
     transform = np.eye(4)
     transform[:3, :3] = np.stack([r1, np.cross(r3, r1), r3], axis=1)
     transform[:3, 3] = origin
-    scaled = bool({"lateral", "common"} & set(free))
     scale = data.spacing * lengths if scaled else data.spacing
+    speed = float(lengths[1]) if reduced.constraints.free == ("axial",) else 1.0
     return ClosedForm(
         image_to_probe=transform,
         point_mm=point,
         scale_mm_per_px=scale if data.pixels else None,
-        sound_speed_factor=float(lengths[1]) if free == ("axial",) else 1.0,
+        sound_speed_factor=speed,
         rms_mm=float(np.sqrt(certificate.objective_mm2 / reduced.images)),
         objective_mm2=certificate.objective_mm2,
         certified=certificate.certified,
