@@ -57,7 +57,7 @@ def closed_form_answer(problem: Problem, plan: SolvePlan) -> Calibration | None:
 def _with_uncertainty(found: ClosedForm, problem: Problem, plan: SolvePlan) -> Calibration | None:
     """The closed form as a calibration without its problem; None where poses are degenerate."""
     blocks, eps = plan.blocks, float(np.finfo(float).eps)
-    unknowns = _unknowns(found, problem)
+    unknowns = Unknowns.of_closed_form(found, problem)
     seen = ImageErrors.of(unknowns, map_arrays(lambda a: a[None], problem), blocks)
     plane = np.zeros_like(seen.mask)
     residual, axial = seen.from_circle(plane)
@@ -97,7 +97,10 @@ def _with_uncertainty(found: ClosedForm, problem: Problem, plan: SolvePlan) -> C
         image_to_probe=found.image_to_probe,
         point=found.point_mm,
         elevation=np.where(seen.mask[0] > 0, seen.q[0, :, 1], 0.0),
-        sigma=_sigmas(seen, used, blocks),
+        # Each with n less a third of the unknowns.
+        sigma=np.sqrt(
+            (seen.errors[0] ** 2).sum(axis=0) / max(used - count_unknowns(blocks) / 3, 1)
+        ),
         offset_law=None,
         channel_sigma=None,
         unknowns_covariance=covariance,
@@ -135,21 +138,6 @@ def _with_uncertainty(found: ClosedForm, problem: Problem, plan: SolvePlan) -> C
         blocks=blocks,
         robust=False,
     )
-
-
-def _unknowns(found: ClosedForm, problem: Problem) -> Unknowns:
-    """The closed form's unknowns with a leading axis."""
-    further = {"sound-speed": [np.array([found.sound_speed_factor])]}
-    if found.scale_mm_per_px is not None:
-        factors = np.asarray(found.scale_mm_per_px) / np.asarray(problem.spacing)
-        further["scale"] = list(factors[:, None])
-    x = found.image_to_probe[None]
-    return Unknowns(x[:, :3, :3], x[:, :3, 3], found.point_mm[None], further)
-
-
-def _sigmas(seen: ImageErrors, used: float, blocks: tuple[str, ...]) -> Float[np.ndarray, 3]:
-    """SDs of lateral position, range and offset, each with n less a third of the unknowns."""
-    return np.sqrt((seen.errors[0] ** 2).sum(axis=0) / max(used - count_unknowns(blocks) / 3, 1.0))
 
 
 def _medium(

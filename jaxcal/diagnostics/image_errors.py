@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from jaxcal.data.problem import Problem
     from jaxcal.model.unknowns import Blocks
     from jaxcal.result.calibration import Calibration
+    from jaxcal.solvers.closed_form.single import ClosedForm
 
 Array = np.ndarray
 
@@ -65,6 +66,16 @@ class Unknowns:
         x, values = np.asarray(answer.image_to_probe), answer.linearisation.further
         further = {} if values is None else split_further(np.asarray(values), answer.blocks)
         return cls(x[:, :3, :3], x[:, :3, 3], np.asarray(answer.point), further)
+
+    @classmethod
+    def of_closed_form(cls, found: ClosedForm, problem: Problem) -> Unknowns:
+        """The unknowns of a closed form of one problem, with a leading axis of length 1."""
+        further = {"sound-speed": [np.array([found.sound_speed_factor])]}
+        if found.scale_mm_per_px is not None:
+            factors = np.asarray(found.scale_mm_per_px) / np.asarray(problem.spacing)
+            further["scale"] = list(factors[:, None])
+        x = np.asarray(found.image_to_probe)[None]
+        return cls(x[:, :3, :3], x[:, :3, 3], np.asarray(found.point_mm)[None], further)
 
     def along(self, axes: int) -> dict[str, list[Array]]:
         """Further unknowns with ``axes`` axes of length 1 after the leading one."""

@@ -268,14 +268,12 @@ def _comparison(
         other = calibrate_closed_form(replace(images, mask=used), estimate=estimate)
     except InputError:
         return None
-    x, point = np.asarray(other.image_to_probe), np.asarray(other.point_mm)
-    spacing = np.asarray(problem.spacing, float)
-    scale, further = np.ones(2), {}
+    x, spacing = np.asarray(other.image_to_probe), np.asarray(problem.spacing, float)
+    scale = np.ones(2)
     if other.scale_mm_per_px is not None:
         scale = np.asarray(other.scale_mm_per_px) / spacing
-        further["scale"] = list(scale[:, None])
     alone = map_arrays(lambda leaf: np.asarray(leaf, float)[None], problem)
-    unknowns = Unknowns(x[None, :3, :3], x[None, :3, 3], point[None], further)
+    unknowns = Unknowns.of_closed_form(other, problem)
     noise = np.asarray(noise_covariance(answer, problem), float)
     if not np.isfinite(noise[used]).all():
         return None
