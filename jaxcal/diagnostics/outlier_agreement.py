@@ -68,7 +68,9 @@ def agreeing_outliers(
         own, problem, kept
     ):
         return None
-    apart = _rms_distance(own, other, problem, grid)
+    stretch = _pixel_size(other, problem) / _pixel_size(own, problem)
+    face = float(np.asarray(problem.face_offset))
+    apart = distance(own.image_to_probe, other.image_to_probe, stretch, grid, face)
     if apart <= LEAST_APART * stated * math.sqrt(1 + kept.sum() / left.sum()):
         return None
     return int(left.sum()), apart
@@ -90,17 +92,3 @@ def _pixel_size(found: ClosedForm, problem: Problem) -> Float[np.ndarray, " 2"]:
     """Lateral and axial size of a pixel, mm; ones for points in mm."""
     spacing = np.asarray(problem.spacing, float)
     return spacing if found.scale_mm_per_px is None else np.asarray(found.scale_mm_per_px)
-
-
-def _rms_distance(
-    first: ClosedForm, second: ClosedForm, problem: Problem, grid: Float[np.ndarray, "m 2"]
-) -> float:
-    """How far apart two fits put the image's pixels on the probe, root mean square, mm."""
-    stretch = _pixel_size(second, problem) / _pixel_size(first, problem)
-    return distance(
-        np.asarray(first.image_to_probe),
-        np.asarray(second.image_to_probe),
-        stretch,
-        grid,
-        float(np.asarray(problem.face_offset)),
-    )
