@@ -11,7 +11,7 @@ from jaxcal import CalibrationError
 from jaxcal.diagnostics.image_errors import ImageErrors
 from jaxcal.diagnostics.residual_checks import inspect
 from jaxcal.diagnostics.uncertainty import assess
-from jaxcal.result.findings import Inspection, Summary
+from jaxcal.result.findings import Summary
 from jaxcal.runtime.arrays import map_arrays
 
 if TYPE_CHECKING:
@@ -52,29 +52,31 @@ def summarise(calibration: Calibration) -> Summary:
         for start in range(0, max(len(whole.mask), 1), CHUNK):
             rows = slice(start, start + CHUNK)
             pieces.append(_piece(map_arrays(lambda leaf, rows=rows: leaf[rows], whole), eps))
-    found = {
-        name: np.concatenate([piece[name] for piece in pieces]).reshape(batch + each.shape[1:])
-        for name, each in pieces[0].items()
-    }
-    inspection = {field.name: found.pop(field.name) for field in fields(Inspection)}
-    return Summary(**found, inspection=Inspection(**inspection))
+    return _joined(pieces, batch)
 
 
-def _piece(answer: Calibration, eps: float) -> dict[str, Array]:
-    """Diagnostics by name, for calibrations with one leading axis."""
+def _piece(answer: Calibration, eps: float) -> Summary:
+    """Diagnostics of calibrations with one leading axis."""
     seen = ImageErrors.of_answer(answer)
     shifted = seen.shifted(answer)
     uncertainty = assess(answer, shifted, eps)
-    spectra = uncertainty.spectra
-    inspection = inspect(answer, seen, shifted, uncertainty, eps)
     residual, _ = seen.from_circle(np.zeros_like(seen.mask))
-    return {
-        "elevation_sd": uncertainty.elevation_sd,
-        "at_bound": uncertainty.at_bound,
-        "residual": np.where(answer.mask[..., None] > 0, residual, 0.0),
-        "condition": spectra.condition,
-        "weakest": spectra.weakest,
-        "weakest_sd": spectra.weakest_sd,
-        "prior_direction": uncertainty.prior_direction,
-        **{field.name: getattr(inspection, field.name) for field in fields(Inspection)},
-    }
+    return Summary(
+        elevation_sd=uncertainty.elevation_sd,
+        at_bound=uncertainty.at_bound,
+        residual=np.where(answer.mask[..., None] > 0, residual, 0.0),
+        condition=uncertainty.spectra.condition,
+        weakest=uncertainty.spectra.weakest,
+        weakest_sd=uncertainty.spectra.weakest_sd,
+        prior_direction=uncertainty.prior_direction,
+        inspection=inspect(answer, seen, shifted, uncertainty, eps),
+    )
+
+
+def _joined(pieces: list[Any], batch: tuple[int, ...]) -> Any:
+    """One object of all pieces, with a batch's axes in front of every array."""
+    if isinstance(pieces[0], np.ndarray):
+        return np.concatenate(pieces).reshape(batch + pieces[0].shape[1:])
+    names = [field.name for field in fields(pieces[0])]
+    parts = {name: [getattr(piece, name) for piece in pieces] for name in names}
+    return type(pieces[0])(**{name: _joined(each, batch) for name, each in parts.items()})
