@@ -46,16 +46,7 @@ class Inspection:
 class Summary:
     """Diagnostics of a calibration, or of a batch with leading axes.
 
-    Attributes:
-        elevation_sd: SDs of the offsets, mm; NaN where an offset is on its bound or not known.
-        at_bound: 1 where an offset rests on its bound.
-        residual: q_i - p_i with p_i in the plane, in the image frame, mm; 0 where left out.
-        condition: largest over smallest eigenvalue of the scaled information.
-        weakest: unit vector (scaled units) of the least known direction of all unknowns.
-        weakest_sd: SD along ``weakest``, mm at the lever arm; NaN where there is no finite SD.
-        prior_direction: unit vector (scaled units) that the measurements alone leave open; zeros
-            where there is none.
-        inspection: what the residuals show.
+    :class:`jaxcal.Calibration` has them as properties of the same names, which say what they are.
     """
 
     elevation_sd: Float[Array, "*batch n"]

@@ -206,24 +206,22 @@ def left_out(transform: ImageTransform, format: SaveFormat) -> str | None:
 
 
 def _record(transform: ImageTransform) -> dict[str, Any]:
-    scale, covariance, full = (
-        transform.scale_mm_per_px,
-        transform.covariance,
-        transform.image_covariance,
-    )
-    probe = transform.probe_frame
+    known, probe = transform.scale_mm_per_px is not None, transform.probe_frame
+    arrays = {
+        "image_plane_to_probe": transform.image_plane_to_probe,
+        "plus_image_to_probe": transform.plus_matrix() if known else None,
+        "scale_mm_per_px": transform.scale_mm_per_px,
+        "face_offset_mm": transform.face_offset_mm,
+        "range_factor": transform.range_factor,
+        "covariance": transform.covariance,
+        "image_unknowns": tangent_names(transform.unknowns),
+        "image_covariance": transform.image_covariance,
+    }
     return {
         "format": FORMAT,
         "version": VERSION,
         "converged": transform.converged,
-        "image_plane_to_probe": transform.image_plane_to_probe.tolist(),
-        "plus_image_to_probe": None if scale is None else transform.plus_matrix().tolist(),
-        "scale_mm_per_px": None if scale is None else scale.tolist(),
-        "face_offset_mm": transform.face_offset_mm,
-        "range_factor": transform.range_factor,
-        "covariance": None if covariance is None else covariance.tolist(),
-        "image_unknowns": tangent_names(transform.unknowns),
-        "image_covariance": None if full is None else full.tolist(),
+        **{k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in arrays.items()},
         "rms_mm": transform.error_mm,
         "pose_frames": None if probe == "Probe" else {"from": probe, "to": None},
         "date": transform.date,
