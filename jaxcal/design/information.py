@@ -22,6 +22,7 @@ import numpy as np
 from jaxcal import InputError
 from jaxcal.data.poses import check_poses, targets_in_images
 from jaxcal.design.noise import Noise, check_result, used_images
+from jaxcal.diagnostics.image_errors import motion
 from jaxcal.model.unknowns import RIGID, block_slice
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.arrays import is_traced
@@ -110,20 +111,13 @@ class Model:
         xp = poses.__array_namespace__()
         q = self.targets(poses)
         turned = xp.swapaxes(poses[..., :3, :3] @ self.image_to_probe[:3, :3], -1, -2)
-        x, y, z = q[..., 0], q[..., 1], q[..., 2]
-        zero, one = xp.zeros_like(x), xp.ones_like(x)
-        # The lateral, range and elevational rows of [-I, [q]x].
-        rigid = [
-            [-one, zero, zero, zero, -z, y],
-            [zero, zero, -one, -y, x, zero],
-            [zero, -one, zero, z, zero, -x],
-        ]
-        scales = [[-x, zero], [zero, self.face_offset_mm - z], [zero, zero]]
-        rows = []
-        for k, axis in enumerate((0, 2, 1)):
-            columns = rigid[k] + [turned[..., axis, j] for j in range(3)]
-            rows.append(xp.stack(columns + (scales[k] if self.scale else []), axis=-1))
-        return xp.stack(rows, axis=-2) / self.noise.sigma(q)[..., None]
+        rows = motion(q, turned, RIGID)
+        if self.scale:
+            zero = xp.zeros_like(q[..., 0])
+            lateral = xp.stack([-q[..., 0], zero, zero], axis=-1)
+            axial = xp.stack([zero, zero, self.face_offset_mm - q[..., 2]], axis=-1)
+            rows = xp.concatenate([rows, xp.stack([lateral, axial], axis=-1)], axis=-1)
+        return rows[..., [0, 2, 1], :] / self.noise.sigma(q)[..., None]
 
     def information(self, poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "p p"]:
         """Sum of G'G over poses."""

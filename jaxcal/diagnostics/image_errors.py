@@ -376,14 +376,17 @@ def quadratic(rows: Float[Array, "k m p"], matrix: Float[Array, "k p p"]) -> Flo
 
 
 def motion(
-    q: Float[Array, "k n 3"], tracker_to_image: Float[Array, "k n 3 3"], blocks: Blocks
-) -> Float[Array, "k n 3 p"]:
-    """Derivatives of q by the unknowns; blocks begin with X and the target."""
-    x, y, z = np.moveaxis(q, -1, 0)
-    along = np.zeros((*q.shape, count_unknowns(blocks)))
-    along[..., [0, 1, 2], [0, 1, 2]] = -1.0
-    along[..., 0, 4], along[..., 0, 5] = -z, y
-    along[..., 1, 3], along[..., 1, 5] = z, -x
-    along[..., 2, 3], along[..., 2, 4] = -y, x
-    along[..., 6:9] = tracker_to_image
-    return along
+    q: Float[AnyArray, "*n 3"], tracker_to_image: Float[AnyArray, "*n 3 3"], blocks: Blocks
+) -> Float[AnyArray, "*n 3 p"]:
+    """Derivatives of q by the unknowns (traceable); blocks begin with X and the target."""
+    xp = array_module(q)
+    x, y, z = q[..., 0], q[..., 1], q[..., 2]
+    zero, one = xp.zeros_like(x), xp.ones_like(x)
+    rows = [
+        [-one, zero, zero, zero, -z, y],
+        [zero, -one, zero, z, zero, -x],
+        [zero, zero, -one, -y, x, zero],
+    ]
+    along = xp.stack([xp.stack(row, axis=-1) for row in rows], axis=-2)
+    further = xp.zeros((*q.shape, count_unknowns(blocks) - RIGID_UNKNOWNS), q.dtype)
+    return xp.concatenate([along, tracker_to_image, further], axis=-1)
