@@ -46,13 +46,7 @@ FEW_PROBLEMS = 1024
 
 @in_own_modes
 def solve_problem(problem: Problem, given: Given, plan: SolvePlan) -> Calibration:
-    """One problem, but for the problem itself in the result (traceable).
-
-    Args:
-        problem: checked.
-        given: numbers that came with the request.
-        plan: what is static about it.
-    """
+    """One problem, but for the problem itself in the result (traceable)."""
     if _is_kept(problem, plan, inside=inside_transformation(problem, given)):
         return _solve_kept(problem, given, plan)
     return _solve_compiled(problem, given, plan)
@@ -106,14 +100,7 @@ def fill_up(problem: Problem, images: int) -> Problem:
 
 @in_own_modes
 def solve_batch(problems: Problem, given: Given, plan: SolvePlan, chunk: int | None) -> Calibration:
-    """A batch with its problems in the result (traceable).
-
-    Args:
-        problems: with leading axes.
-        given: numbers that came with the request.
-        plan: what is static about it.
-        chunk: problems solved side by side; None: by their kind.
-    """
+    """A batch with its problems in the result (traceable); by default the chunk is for its kind."""
     shape = problems.batch_shape
     flat = problems
     if len(shape) > 1:

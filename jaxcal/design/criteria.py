@@ -127,11 +127,6 @@ def gains(
 ) -> Float[np.ndarray, " m"]:
     """The gains of many poses (numpy), in ln tr(W S), or in ln det S without W; see :func:`gain`.
 
-    Args:
-        rows: G of every pose.
-        covariance: S.
-        weight: W; None: the D criterion.
-
     Returns:
         -ln(1 - gain / tr(W S)), or ln det(I + A) / p: the decrease of either logarithm.
     """

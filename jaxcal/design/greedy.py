@@ -243,12 +243,7 @@ def choose(
 
 
 def exchange(search: Search, chosen: Chosen) -> Chosen:
-    """Improve what greedy chose; poses that fill space stay.
-
-    Args:
-        search: candidates and what is known.
-        chosen: by :func:`choose`.
-    """
+    """Improve what greedy chose; poses that fill space stay."""
     rows, information = list(chosen.rows), chosen.information.copy()
     scores = search.scores(information)
     order = np.argsort(-scores)

@@ -189,12 +189,6 @@ def effective_elevational(
 
     If the offsets' law has edges, an offset tells more than its SD says; if their mean must be
     estimated, it tells less. The factor applies to further images of the same kind, too.
-
-    Args:
-        result: of one problem.
-        model: with the calibration's X, target and SDs.
-        poses: of the images.
-        weight: W of the criterion.
     """
     covariance = _of_model(result, model)
     used = used_images(result, len(poses))

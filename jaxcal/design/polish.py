@@ -94,11 +94,6 @@ def polish(search: Search, candidates: Candidates, chosen: Chosen) -> Float[np.n
     """The chosen poses, moved one after the other.
 
     Those that fill space stay, and so do a caller's own that are outside the constraints.
-
-    Args:
-        search: the search that chose the poses.
-        candidates: the candidates of the search.
-        chosen: the chosen poses.
     """
     model, bounds = candidates.model, candidates.constraints
     x, point = np.asarray(model.image_to_probe), np.asarray(model.point)

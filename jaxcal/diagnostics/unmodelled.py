@@ -103,12 +103,9 @@ class Unmodelled:
 
 
 def unmodelled(calibration: Calibration) -> list[Unmodelled]:
-    """What the residuals of one calibration show, the clearest first.
+    """What the residuals of one calibration with concrete values show, the clearest first.
 
     Only the joint method's fits of points with SDs and without a tracker's are looked at.
-
-    Args:
-        calibration: of one problem, with concrete values.
     """
     used = np.asarray(calibration.mask) > 0
     fits = calibration.method == "joint" and calibration.prior in TUNED

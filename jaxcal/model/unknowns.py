@@ -201,14 +201,7 @@ def predicted_distance(distance: Any, values: Values) -> Any:
 
 
 def stepped(name: str, value: Any, step: Any, exp: Callable[[Any], Any]) -> Any:
-    """A component of a further unknown after a step.
-
-    Args:
-        name: of the unknown.
-        value: of the component.
-        step: its tangent.
-        exp: the exponential of numpy or of JAX.
-    """
+    """A component of a further unknown after a step, with the exponential of numpy or of JAX."""
     return value * exp(step) if TABLE[name].step == "factor" else value + step
 
 

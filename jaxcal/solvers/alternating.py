@@ -136,14 +136,7 @@ def bounded(
     max_steps: int = 100,
     trace: int = 0,
 ) -> Minimum:
-    """The joint solve with bounded offsets.
-
-    Args:
-        start: conventional fits.
-        observation: the bounds.
-        images: the data.
-        max_steps: most passes from each start.
-        trace: how many values of the objective to keep (of the joint steps from the best start).
+    """The joint solve with bounded offsets, from conventional fits; its trace is of the best start.
 
     Returns:
         The fits; their iterations count those from all starts, and the warm-up.

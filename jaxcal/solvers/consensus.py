@@ -105,12 +105,7 @@ def depth_scaled_errors(parameters: Parameters, problem: Problem) -> Float[Array
 
 
 def find_consensus(problem: Problem, model: ConsensusModel) -> Float[Array, " n"]:
-    """Find the images that agree: 1 for them, 0 for the others.
-
-    Args:
-        problem: one problem; images masked out stay out.
-        model: what agreeing means.
-    """
+    """Find the images that agree: 1 for them, 0 for the others and for images masked out."""
     used = problem.mask
     subsets = subset_weights(used, model.subset)
     subsets = jnp.concatenate([used[None], subsets])

@@ -72,15 +72,7 @@ def solve(
     plan: SolvePlan,
     begun: ConventionalStart | None = None,
 ) -> Solution:
-    """Solve a batch (one leading axis); images left out must hold harmless values.
-
-    Args:
-        problems: the batch.
-        images: its planes.
-        given: numbers that came with the request.
-        plan: the static part of the request.
-        begun: the batch's conventional fits, where they have been made before.
-    """
+    """Solve a batch (one leading axis); images left out must hold harmless values."""
     # The solvers see constants; their answers become functions of the data again afterwards.
     frozen, planes, numbers = jax.lax.stop_gradient((problems, images, given))
     begun = begin(planes, plan) if begun is None else begun

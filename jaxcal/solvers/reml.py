@@ -206,15 +206,7 @@ def updated(
     move: Float[Array, "p batch"],
     count: Float[Array, "k batch"],
 ) -> Float[Array, "k batch"]:
-    """Helmert's update after a step.
-
-    Args:
-        sums: of the images, by component.
-        normal: Gauss-Newton's equations with these SDs.
-        sigma: mm.
-        move: the step.
-        count: residuals of each component.
-    """
+    """Helmert's update after a step."""
     diagonal = normal.diagonal()
     ridge = 16 * jnp.finfo(count.dtype).eps * jnp.where(diagonal > 0, diagonal, 1.0)
     eye = jnp.eye(len(diagonal), dtype=diagonal.dtype)[..., None]
@@ -377,18 +369,12 @@ def self_tuned(
     max_rounds: int = 100,
     trace: int = 0,
 ) -> SelfTuned:
-    """Solve every problem, its SDs estimated by REML.
+    """Solve every problem from a conventional fit, its SDs estimated by REML.
+
+    Problems with fewer than 8 used images keep the observation's SDs.
 
     It stops at a gradient cosine of 1e-10 and a relative change of the SDs of 1e-9 in float64, and
     at 1e-4 for both in float32.
-
-    Args:
-        start: a conventional fit.
-        observation: the objective; problems with fewer than 8 used images keep its SDs.
-        images: the data.
-        medium: prior of further unknowns, or None.
-        max_rounds: most passes.
-        trace: how many values of the objective to keep.
     """
     fallback, count = observation.sigma, observation.count(images)
     enough = images.used >= MINIMUM_SELF_TUNING

@@ -94,16 +94,7 @@ def minimise_with(
     medium: MediumPrior | None,
     options: Options,
 ) -> Fit:
-    """Minimise the objective of one problem.
-
-    Args:
-        solver: of optimistix.
-        start: unknowns to start from.
-        observation: the objective.
-        images: the data, a batch of one.
-        medium: prior of further unknowns, or None.
-        options: with the largest number of steps and the length of the trace.
-    """
+    """Minimise the objective of one problem, a batch of one."""
 
     def residual(step: Array, _: None) -> Array:
         moved = start.moved(step[:, None])
@@ -125,16 +116,7 @@ def self_tuned_with(
     medium: MediumPrior | None,
     options: Options,
 ) -> Fit:
-    """Weighted solves with Helmert's updates between them, until the SDs no longer change.
-
-    Args:
-        solver: of optimistix.
-        start: the conventional fit.
-        observation: the objective; its SDs are held where too few images determine them.
-        images: the data, a batch of one.
-        medium: prior of further unknowns, or None.
-        options: with the largest number of steps of each solve.
-    """
+    """Weighted solves of one problem, with Helmert's updates between them until the SDs stay."""
     enough = images.used >= MINIMUM_SELF_TUNING
     squares = component_sums(start, observation, images, None, medium).squares
     crude = with_floor(jnp.sqrt(squares / observation.count(images)))

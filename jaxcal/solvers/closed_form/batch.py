@@ -59,11 +59,7 @@ SHORTER = 0.25
 
 
 def solve_batch(problems: Problem, estimate: tuple[str, ...]) -> ClosedForm:
-    """Conventional calibrations of problems with any leading axes.
-
-    Args:
-        problems: concrete or traced.
-        estimate: as for :func:`jaxcal.calibrate_closed_form`.
+    """Conventional calibrations of problems with any leading axes, concrete or traced.
 
     Returns:
         Arrays with the problems' leading axes. Concrete problems give numpy arrays in float64, and

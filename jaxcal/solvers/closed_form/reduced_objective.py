@@ -334,13 +334,7 @@ def multipliers(reduced: ReducedObjective, x: Float[np.ndarray, 6]) -> Float[np.
 def duality_gap(
     reduced: ReducedObjective, x: Float[np.ndarray, 6], values: Float[np.ndarray, " k"]
 ) -> float:
-    """f(x) less the bound that multipliers prove; inf where M is not positive definite.
-
-    Args:
-        reduced: f and its constraints.
-        x: satisfies the constraints.
-        values: multipliers.
-    """
+    """f(x) of a feasible x less the bound that multipliers prove; inf where M is indefinite."""
     added = np.tensordot(values, reduced.constraints.matrices, 1)
     squared = reduced.factor.T @ reduced.factor
     try:
