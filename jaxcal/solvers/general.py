@@ -110,12 +110,12 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     def init(
         self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any
     ) -> tuple[Descent, Rounding, Any]:
-        flat, _ = ravel_pytree(y)
-        start = Flat(flat[:, None])
-        state = Descent.before(start, jnp.zeros(1, flat.dtype), self.damping)
-        value, aux = fn(y, args)
-        size = jnp.max(jnp.abs(ravel_pytree(value)[0]))[None]
-        rounding = jnp.finfo(flat.dtype).eps * size
+        return self._before(Flat(ravel_pytree(y)[0][:, None]), *fn(y, args))
+
+    def _before(self, start: Flat, value: Any, aux: Any) -> tuple[Descent, Rounding, Any]:
+        dtype = start.shared.dtype
+        state = Descent.before(start, jnp.zeros(1, dtype), self.damping)
+        rounding = jnp.finfo(dtype).eps * jnp.max(jnp.abs(ravel_pytree(value)[0]))[None]
         return state, Rounding(rounding, 0.0 * rounding), aux
 
     def step(self, fn: Any, y: Any, args: Any, options: Any, state: Any, tags: Any) -> tuple:
@@ -250,11 +250,7 @@ class _ArrowSolver(LevenbergMarquardt):
     def init(
         self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any
     ) -> tuple[Descent, Rounding, Any]:
-        value, aux = fn(y, args)
-        iterate = self._at(fn, y, args)[0]
-        state = Descent.before(iterate, jnp.zeros(1, iterate.shared.dtype), self.damping)
-        rounding = jnp.finfo(iterate.shared.dtype).eps * jnp.max(jnp.abs(value))[None]
-        return state, Rounding(rounding, 0.0 * rounding), aux
+        return self._before(self._at(fn, y, args)[0], *fn(y, args))
 
     def step(self, fn: Any, y: Any, args: Any, options: Any, state: Any, tags: Any) -> tuple:
         descent, rounding, aux = state

@@ -146,14 +146,13 @@ def run(
     """The plan's method from conventional fits."""
     observation, medium = observe(problems, images, given, plan)
     found = _descended(begun, observation, medium, images, plan)
-    zero = jnp.zeros_like(found.cost)
     floored, rounds = jnp.zeros((images.batch_size, 3), bool), jnp.zeros_like(found.iterations)
     if plan.self_tuning:
         assert isinstance(found, SelfTuned | Fit)
         observation = observation.with_sigma(found.updated)
         floored = on_floor(found.updated).T[:, [*observation.error_sd]]
         rounds = found.iterations
-    moves = (zero, zero)
+    moves = (jnp.zeros_like(found.cost),) * 2
     if isinstance(found, Alternation):
         moves = (found.rotation_change, found.translation_change)
     convergence = Convergence(
@@ -205,14 +204,7 @@ def _descended(
         solve_with = self_tuned_with if plan.self_tuning else minimise_with
         return solve_with(other, start, observation, images, medium, options)
     if plan.self_tuning:
-        return self_tuned(
-            start,
-            observation,
-            images,
-            medium=medium,
-            max_rounds=options.max_iterations,
-            trace=options.trace,
-        )
+        return self_tuned(start, observation, images, medium=medium, **limits)
     return minimise(start, observation, images, medium=medium, damping=1e-6, **limits)
 
 
@@ -226,16 +218,14 @@ def _attached(
             found.iterate, found.observation.sigma, observation, images, medium
         )
         observation = observation.with_sigma(sigma)
-    elif plan.method == "alternating" and not _ends_still(plan.options):
+    elif plan.method == "alternating" and not (
+        plan.options.tolerance_mm <= implicit.STILL_MM
+        and plan.options.tolerance_rad <= implicit.STILL_RAD
+    ):
         step = implicit.undefined_tangent(found.iterate, observation, images)
     else:
         step = implicit.implicit_tangent(found.iterate, observation, images, medium)
     return replace(found, iterate=found.iterate.moved(step), observation=observation, medium=medium)
-
-
-def _ends_still(options: Options) -> bool:
-    near = options.tolerance_mm <= implicit.STILL_MM
-    return near and options.tolerance_rad <= implicit.STILL_RAD
 
 
 def _averaged(found: Solution, images: ImagePlanes, problems: Problem, plan: SolvePlan) -> Solution:

@@ -237,7 +237,7 @@ class Tuning(eqx.Module):
         coordinates: size of the coordinates that rounding acts on, mm.
         cosine_tolerance: gradient cosine below which the unknowns have converged.
         sigma_tolerance: relative change of an update below which the SDs have converged.
-        max_rounds: most passes.
+        max_steps: most passes.
     """
 
     observation: Observation
@@ -249,7 +249,7 @@ class Tuning(eqx.Module):
     coordinates: Float[Array, " batch"]
     cosine_tolerance: float = eqx.field(static=True)
     sigma_tolerance: float = eqx.field(static=True)
-    max_rounds: int = eqx.field(static=True)
+    max_steps: int = eqx.field(static=True)
 
     def propose(self, sums: ComponentSums, sigma: Array, damping: Array, exact: Array) -> Proposal:
         """From the sums at an iterate, a few updates of the SDs and the step for the new SDs."""
@@ -332,7 +332,7 @@ class Tuning(eqx.Module):
         more = jnp.maximum(DAMPING_INCREASE * damping, LEAST_DAMPING)
         damping = jnp.where(found.indefinite & accept, more, damping)
         iterations = state.iterations + 1
-        given_up = (damping > LARGEST_DAMPING) | (iterations >= self.max_rounds)
+        given_up = (damping > LARGEST_DAMPING) | (iterations >= self.max_steps)
         given_up = given_up | jnp.logical_not(jnp.isfinite(cost))
         retry = found.indefinite | jnp.logical_not(accept)
         new = SelfTuned(
@@ -366,7 +366,7 @@ def self_tuned(
     images: ImagePlanes,
     *,
     medium: MediumPrior | None = None,
-    max_rounds: int = 100,
+    max_steps: int = 100,
     trace: int = 0,
 ) -> SelfTuned:
     """Solve every problem from a conventional fit, its SDs estimated by REML.
@@ -394,7 +394,7 @@ def self_tuned(
         coordinates=coordinates,
         cosine_tolerance=cosine_tolerance,
         sigma_tolerance=10 * cosine_tolerance if cosine_tolerance < 1e-9 else cosine_tolerance,
-        max_rounds=max_rounds,
+        max_steps=max_steps,
     )
     begun = SelfTuned.before(barrier(start), fallback, trace)
 
