@@ -34,7 +34,7 @@ from jaxcal.solvers.auto import Averaged, average_over_laws
 from jaxcal.solvers.convergence import Convergence
 from jaxcal.solvers.gradient_descent import pairwise_gradient
 from jaxcal.solvers.levenberg_marquardt import Minimum, minimise
-from jaxcal.solvers.plan import DEFAULT_MAX_ELEVATION_MM, Given, Options, SolvePlan
+from jaxcal.solvers.plan import DEFAULT_MAX_ELEVATION_MM, Given, SolvePlan
 from jaxcal.solvers.reml import SelfTuned, on_floor, self_tuned
 from jaxcal.solvers.start import ConventionalStart, conventional
 from jaxcal.solvers.with_optimistix import Fit, minimise_with, self_tuned_with
