@@ -88,7 +88,7 @@ def assemble(
     used = jnp.sum(mask, axis=-1)
     errors = Errors.of(iterate, images)
     elevation = mask * errors.q[1]
-    in_plane = errors.squares(errors.q[1])
+    in_plane = errors.squares(errors.q[1], errors.distance)
 
     variance, bounds = jnp.ones_like(used), None
     if bound is not None and local is not None:
@@ -203,13 +203,9 @@ class Errors(eqx.Module):
         )
         return cls((x, y, z), lateral, distance, images.mask)
 
-    def squares(self, *planes: Array, axial: Array | None = None) -> Float[Array, "*batch"]:
-        """Sum over the images of |q - (lateral, 0, axial)|^2; axial is the range by default.
-
-        The planes replace q's elevational component.
-        """
-        axial = self.distance if axial is None else axial
-        parts = (self.q[0] - self.lateral, *planes, self.q[2] - axial)
+    def squares(self, elevational: Array, axial: Array) -> Float[Array, "*batch"]:
+        """Sum over the images of |q - (lateral, y, axial)|^2 with q_y - y ``elevational``."""
+        parts = (self.q[0] - self.lateral, elevational, self.q[2] - axial)
         return jnp.sum(self.mask * sum(part**2 for part in parts), axis=-1)
 
     def lever(self) -> Float[Array, "*batch"]:
@@ -241,7 +237,7 @@ class ActiveBounds(eqx.Module):
         axial = jnp.sqrt(jnp.maximum(distance**2 - y**2, (1e-6 * distance) ** 2))
         slope = y / axial
         elevational = errors.q[1] - y
-        cost = errors.squares(elevational, axial=axial)
+        cost = errors.squares(elevational, axial)
         limit = jnp.minimum(bound, LARGEST_ELEVATION * jnp.abs(distance))
         # The derivative of half the cost by y; at an offset on its bound it points outwards.
         force = slope * (errors.q[2] - axial) - elevational

@@ -329,12 +329,7 @@ def options_of(options: Options | None) -> Options:
 
 
 def check_alternation(names: Iterable[str], method: str) -> None:
-    """Refuse options of the alternation (:data:`ALTERNATION`) that another method was given.
-
-    Args:
-        names: of the given ones, as the caller wrote them.
-        method: the method's name.
-    """
+    """Refuse options of the alternation (:data:`ALTERNATION`) that another method was given."""
     if (given := " and ".join(names)) and method != "alternating":
         raise InputError(f"only the alternating method has {given}")
 

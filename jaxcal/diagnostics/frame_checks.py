@@ -78,12 +78,7 @@ ANISOTROPY = 1.02
 
 
 def wrong_frames(data: Problem | Images, estimate: tuple[str, ...] = ()) -> str | None:
-    """What is wrong with the frames or units, and what to do, in one line; None if nothing is.
-
-    Args:
-        data: one problem with concrete values, or images with points.
-        estimate: what the calibration estimates.
-    """
+    """What is wrong with the frames or units, and what to do, in one line; None if nothing is."""
     known = knows_spacing(data)
     try:
         images, _ = image_data(data, () if known else ("scale",))

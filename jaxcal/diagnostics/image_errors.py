@@ -290,11 +290,8 @@ def error_sd(answer: Calibration) -> Float[AnyArray, "*batch 3"]:
 def further_prior(answer: Calibration) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
     """Precisions of the priors on further unknowns, and how far the answer is from nominal.
 
-    Both are in the order of one calibration's unknowns, in the units of their steps; 0 for those
-    without a prior.
-
-    Args:
-        answer: one calibration, with one leading axis.
+    The answer is one calibration with a leading axis. Both are in the order of its unknowns, in
+    the units of their steps; 0 for those without a prior.
     """
     precision, away = np.zeros((2, count_unknowns(answer.blocks)))
     prior_sd = answer.linearisation.prior_sd
