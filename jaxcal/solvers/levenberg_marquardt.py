@@ -8,9 +8,10 @@ first candidate is the start, so that only one loop body has to be compiled.
 The acceptance rule is that of More (1978) with Nielsen's (1999) constants: a step is taken where
 the cost falls by at least a ten-thousandth of the decrease that the quadratic model predicts. The
 damping falls where the cost falls by at least a quarter of it, and grows tenfold where a step is
-refused. Every loop of the package uses this rule, by :func:`judge_step`. Steps are Gauss-Newton's
-where the gradient cosine is above :data:`EXACT_BELOW`, and exact Newton steps below it; where the
-exact matrix is indefinite, the same iterate is evaluated again without second derivatives.
+refused. Every loop of the package uses this rule, by :meth:`LoopState.judged`. Steps are
+Gauss-Newton's where the gradient cosine is above :data:`EXACT_BELOW`, and exact Newton steps below
+it; where the exact matrix is indefinite, the same iterate is evaluated again without second
+derivatives.
 
 A problem stops when the largest cosine between its residual and a column of its Jacobian is below
 the tolerance, when its residuals are nothing but rounding, or when steps gain no more than
@@ -28,7 +29,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import fields
-from typing import Any
+from typing import Any, Self
 
 import equinox as eqx
 import jax
@@ -70,63 +71,6 @@ Equations = Callable[[Any, Float[Array, " batch"]], NormalEquations]
 """From unknowns, and 1 where second derivatives are to be exact, to their normal equations."""
 
 
-class StepJudgement(eqx.Module):
-    """The judgement of a step.
-
-    Attributes:
-        accept: the step is taken.
-        damping: Marquardt's lambda for the next step.
-        stalled: number of successive steps without a gain above rounding.
-    """
-
-    accept: Bool[Array, " batch"]
-    damping: Float[Array, " batch"]
-    stalled: Int[Array, " batch"]
-
-
-def judge_step(
-    decrease: Float[Array, " batch"],
-    predicted: Float[Array, " batch"],
-    half_cost: Float[Array, " batch"],
-    rounding: Float[Array, " batch"],
-    damping: Float[Array, " batch"],
-    stalled: Int[Array, " batch"],
-    *,
-    exact: Bool[Array, " batch"],
-    retry: Bool[Array, " batch"],
-    decrease_exact: float = DAMPING_DECREASE_EXACT,
-    allowance: Float[Array, " batch"] | float = 0.0,
-) -> StepJudgement:
-    """The acceptance rule.
-
-    Args:
-        decrease: of half the cost.
-        predicted: the decrease that the quadratic model predicts.
-        half_cost: before the step.
-        rounding: of one whitened residual.
-        damping: of the step.
-        stalled: number of successive steps without a gain before it.
-        exact: the step came from exact second derivatives.
-        retry: there was no step; the same iterate was evaluated again.
-        decrease_exact: factor on the damping after a good exact step.
-        allowance: by how much half the cost may have grown for other reasons than the step.
-    """
-    # Each residual is off by its rounding, so half their sum of squares is off by this much.
-    noise = 8 * jnp.finfo(half_cost.dtype).eps * half_cost + 2 * rounding * jnp.sqrt(half_cost)
-    least = -noise - allowance
-    accept = (decrease >= ACCEPT_RATIO * predicted + least) | retry
-    good = (decrease >= GOOD_RATIO * predicted + least) & jnp.logical_not(retry)
-    # The exact matrix needs no damping; Gauss-Newton's needs less and less.
-    factor = jnp.where(good, jnp.where(exact, decrease_exact, DAMPING_DECREASE), 1.0)
-    raised = jnp.maximum(DAMPING_INCREASE * damping, LEAST_DAMPING)
-    gained = jnp.where(decrease > noise, 0, stalled + 1)
-    return StepJudgement(
-        accept,
-        jnp.where(accept, factor * damping, raised),
-        jnp.where(accept & jnp.logical_not(retry), gained, stalled),
-    )
-
-
 class Minimum(eqx.Module):
     """Where a method stopped, or how far its loop has come, for every problem; batch axis last.
 
@@ -148,14 +92,13 @@ class Minimum(eqx.Module):
     trace: Float[Array, "trace batch"] | None
 
 
-class Descent(Minimum):
-    """The state of the loop, for every problem.
+class LoopState(Minimum):
+    """The state of a loop, for every problem.
 
     Attributes:
         candidate: the unknowns to evaluate next.
         retry: ``candidate`` is ``iterate`` again, with more damping or without second derivatives.
         exact_used: 1 where the step to the candidate came from an exact curvature.
-        exact_next: 1 where the candidate's curvature is to be exact.
         damping: Marquardt's lambda.
         predicted: predicted decrease of half the cost by the step to the candidate.
         stalled: number of successive steps without a gain above rounding.
@@ -165,16 +108,15 @@ class Descent(Minimum):
     candidate: Any
     retry: Bool[Array, " batch"]
     exact_used: Float[Array, " batch"]
-    exact_next: Float[Array, " batch"]
     damping: Float[Array, " batch"]
     predicted: Float[Array, " batch"]
     stalled: Int[Array, " batch"]
     active: Bool[Array, " batch"]
 
     @classmethod
-    def before(
-        cls, start: Any, number: Float[Array, " batch"], damping: float, *, trace: int = 0
-    ) -> Descent:
+    def first(
+        cls, start: Any, number: Float[Array, " batch"], damping: float, trace: int, **own: Any
+    ) -> Self:
         """The state before the first evaluation.
 
         Args:
@@ -182,6 +124,7 @@ class Descent(Minimum):
             number: zeros, one for every problem.
             damping: first lambda, relative to the diagonal.
             trace: how many values of the cost to keep.
+            own: the further fields of a loop.
         """
         no, count = jnp.zeros(number.shape, bool), jnp.zeros(number.shape, jnp.int32)
         return cls(
@@ -191,7 +134,6 @@ class Descent(Minimum):
             candidate=start,
             retry=~no,
             exact_used=number,
-            exact_next=number,
             damping=number + damping,
             predicted=number,
             stalled=count,
@@ -199,7 +141,62 @@ class Descent(Minimum):
             converged=no,
             active=~no,
             trace=empty_trace(trace, number),
+            **own,
         )
+
+    def judged(
+        self,
+        half_cost: Float[Array, " batch"],
+        after: Float[Array, " batch"],
+        rounding: Float[Array, " batch"],
+        *,
+        decrease_exact: float = DAMPING_DECREASE_EXACT,
+        allowance: Float[Array, " batch"] | float = 0.0,
+    ) -> tuple[Bool[Array, " batch"], Float[Array, " batch"], Int[Array, " batch"]]:
+        """The acceptance rule: whether the step to the candidate is taken, and what follows it.
+
+        Args:
+            half_cost: half the cost before the step.
+            after: half the cost at the candidate.
+            rounding: of one whitened residual.
+            decrease_exact: factor on the damping after a good exact step.
+            allowance: by how much half the cost may have grown for other reasons than the step.
+
+        Returns:
+            Whether it is taken, the damping of the next step, and ``stalled`` after it.
+        """
+        # Each residual is off by its rounding, so half their sum of squares is off by this much.
+        noise = 8 * jnp.finfo(half_cost.dtype).eps * half_cost + 2 * rounding * jnp.sqrt(half_cost)
+        least, decrease, stepped = -noise - allowance, half_cost - after, ~self.retry
+        accept = (decrease >= ACCEPT_RATIO * self.predicted + least) | self.retry
+        good = (decrease >= GOOD_RATIO * self.predicted + least) & stepped
+        # The exact matrix needs no damping; Gauss-Newton's needs less and less.
+        lower = jnp.where(self.exact_used > 0, decrease_exact, DAMPING_DECREASE)
+        factor = jnp.where(good, lower, 1.0)
+        raised = jnp.maximum(DAMPING_INCREASE * self.damping, LEAST_DAMPING)
+        gained = jnp.where(decrease > noise, 0, self.stalled + 1)
+        return (
+            accept,
+            jnp.where(accept, factor * self.damping, raised),
+            jnp.where(accept & stepped, gained, self.stalled),
+        )
+
+
+class Descent(LoopState):
+    """The state of :func:`minimise`.
+
+    Attributes:
+        exact_next: 1 where the candidate's curvature is to be exact.
+    """
+
+    exact_next: Float[Array, " batch"]
+
+    @classmethod
+    def before(
+        cls, start: Any, number: Float[Array, " batch"], damping: float, *, trace: int = 0
+    ) -> Descent:
+        """The state before the first evaluation, as :meth:`first`."""
+        return cls.first(start, number, damping, trace, exact_next=number)
 
 
 def empty_trace(length: int, number: Float[Array, " batch"]) -> Float[Array, "trace batch"] | None:
@@ -295,18 +292,9 @@ def iterate_once(
     normal = barrier(equations(state.candidate, state.exact_next))
 
     half = 0.5 * jnp.where(state.retry, normal.cost, state.cost)
-    judged = judge_step(
-        half - 0.5 * normal.cost,
-        state.predicted,
-        half,
-        rounding.residual,
-        state.damping,
-        state.stalled,
-        exact=state.exact_used > 0,
-        retry=state.retry,
-        decrease_exact=decrease_exact,
+    accept, damping, stalled = state.judged(
+        half, 0.5 * normal.cost, rounding.residual, decrease_exact=decrease_exact
     )
-    accept, damping, stalled = judged.accept, judged.damping, judged.stalled
     if undamped:
         accept, damping = jnp.isfinite(normal.cost), jnp.zeros_like(damping)
 

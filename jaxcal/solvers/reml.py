@@ -36,7 +36,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from jaxcal.model.batch import ImagePlanes, Iterate, barrier, choose
 from jaxcal.model.observations import MediumPrior, Observation
@@ -47,14 +47,11 @@ from jaxcal.solvers.levenberg_marquardt import (
     LARGEST_DAMPING,
     LEAST_DAMPING,
     MOST_STALLED,
-    Minimum,
+    LoopState,
     Rounding,
-    StepJudgement,
     damped_step,
     default_tolerance,
-    empty_trace,
     gradient_cosine,
-    judge_step,
     largest_coordinate,
     recorded,
 )
@@ -109,7 +106,7 @@ def helmert(
     return jnp.sqrt(jnp.maximum(squares, 0.0) / freedom)
 
 
-class SelfTuned(Minimum):
+class SelfTuned(LoopState):
     """The state of every problem; at the end, its answer.
 
     A problem has converged if the SDs met their tolerance, and the gradient cosine met its own or
@@ -119,62 +116,19 @@ class SelfTuned(Minimum):
         sigma: the SDs, mm.
         updated: the SDs after one more update at ``iterate``, mm.
         change: largest relative change of the SDs by that update (its logarithm).
-        candidate: the unknowns to evaluate next.
         proposed: the SDs at ``candidate``, mm.
         units: the SDs with which the residuals were formed in the last pass, mm.
-        retry: ``candidate`` is ``iterate`` again, with more damping.
         step_sigma: the SDs for which the step to the candidate was computed, mm.
         half_cost: half the cost before that step, with ``step_sigma``.
-        predicted: predicted decrease of ``half_cost`` by that step.
-        exact_used: 1 where the step came from exact second derivatives.
-        damping: Marquardt's lambda.
-        stalled: number of successive steps without a gain above rounding.
-        active: the problem is not finished.
     """
 
     sigma: Float[Array, "k batch"]
     updated: Float[Array, "k batch"]
     change: Float[Array, " batch"]
-    candidate: Iterate
     proposed: Float[Array, "k batch"]
     units: Float[Array, "k batch"]
-    retry: Bool[Array, " batch"]
     step_sigma: Float[Array, "k batch"]
     half_cost: Float[Array, " batch"]
-    predicted: Float[Array, " batch"]
-    exact_used: Float[Array, " batch"]
-    damping: Float[Array, " batch"]
-    stalled: Int[Array, " batch"]
-    active: Bool[Array, " batch"]
-
-    @classmethod
-    def before(cls, start: Iterate, fallback: Float[Array, "k batch"], trace: int) -> SelfTuned:
-        """The state before the first pass; infinite SDs leave out exact second derivatives."""
-        number = jnp.zeros_like(start.point[0])
-        no, count = jnp.zeros(number.shape, bool), jnp.zeros(number.shape, jnp.int32)
-        sigma = jnp.zeros_like(fallback) + jnp.inf
-        return cls(
-            iterate=start,
-            sigma=sigma,
-            updated=sigma,
-            cost=number,
-            change=number,
-            cosine=number,
-            candidate=start,
-            proposed=sigma,
-            units=sigma,
-            retry=~no,
-            step_sigma=sigma,
-            half_cost=number,
-            predicted=number,
-            exact_used=number,
-            damping=number + 1e-6,
-            stalled=count,
-            iterations=count,
-            converged=no,
-            active=~no,
-            trace=empty_trace(trace, number),
-        )
 
 
 class Proposal(eqx.Module):
@@ -284,23 +238,6 @@ class Tuning(eqx.Module):
         carry = (jnp.zeros((), jnp.int32), begun)
         return jax.lax.while_loop(lambda carry: carry[0] < UPDATES, again, carry)[1]
 
-    def judge(self, state: SelfTuned, sums: ComponentSums, rounding: Rounding) -> StepJudgement:
-        """Whether the step to the candidate is accepted."""
-        # New SDs may change the units of the residuals, and so the cost, without any step.
-        whitened = sums.squares / state.step_sigma**2
-        growth = self.observation.growth(state.units, state.proposed, whitened)
-        return judge_step(
-            state.half_cost - 0.5 * sums.weighted(1 / state.step_sigma**2).cost,
-            state.predicted,
-            state.half_cost,
-            rounding.residual,
-            state.damping,
-            state.stalled,
-            exact=state.exact_used > 0,
-            retry=state.retry,
-            allowance=growth,
-        )
-
     def iterate_once(self, state: SelfTuned) -> SelfTuned:
         """One pass over the images at the candidate, and the next candidate."""
         observed = self.observation.in_units(state.proposed)
@@ -313,17 +250,23 @@ class Tuning(eqx.Module):
         normal = sums.weighted(1 / proposed**2)
         rounding = Rounding.at(self.coordinates, 1 / jnp.min(proposed, axis=0), self.images)
         cosine = gradient_cosine(normal, rounding.vanished)
-        judged = self.judge(state, sums, rounding)
+        # New SDs may change the units of the residuals, and so the cost, without any step.
+        whitened = sums.squares / state.step_sigma**2
+        accept, damping, stalled = state.judged(
+            state.half_cost,
+            0.5 * sums.weighted(1 / state.step_sigma**2).cost,
+            rounding.residual,
+            allowance=self.observation.growth(state.units, state.proposed, whitened),
+        )
         iterate, sigma, cost, cosine = barrier(
             choose(
-                judged.accept & state.active,
+                accept & state.active,
                 (state.candidate, proposed, normal.cost, cosine),
                 (state.iterate, state.sigma, state.cost, state.cosine),
             )
         )
         # Where the candidate is refused, the proposal from its sums is not used.
         exact = jnp.where(cosine <= EXACT_BELOW, 1.0, 0.0).astype(self.coordinates.dtype)
-        accept, damping, stalled = judged.accept, judged.damping, judged.stalled
         found = self.propose(sums, sigma, damping, exact)
         change = jnp.max(jnp.abs(jnp.log(found.updated / sigma)), axis=0)
         change = jnp.where(accept, change, state.change)
@@ -396,7 +339,21 @@ def self_tuned(
         sigma_tolerance=10 * cosine_tolerance if cosine_tolerance < 1e-9 else cosine_tolerance,
         max_steps=max_steps,
     )
-    begun = SelfTuned.before(barrier(start), fallback, trace)
+    # Infinite SDs leave out exact second derivatives.
+    unknown, number = jnp.full_like(fallback, jnp.inf), jnp.zeros_like(start.point[0])
+    begun = SelfTuned.first(
+        barrier(start),
+        number,
+        1e-6,
+        trace,
+        sigma=unknown,
+        updated=unknown,
+        change=number,
+        proposed=unknown,
+        units=unknown,
+        step_sigma=unknown,
+        half_cost=number,
+    )
 
     # Not the bound method itself: JAX hashes what it loops over, and arrays have no hash.
     return jax.lax.while_loop(
