@@ -195,7 +195,8 @@ class ImageErrors:
 
     def circle_rows(self, axial: Float[Array, "k n"]) -> Float[Array, "k n 3 p"]:
         """Derivatives of :meth:`from_circle` by the unknowns, the elevation held."""
-        rows = motion(self.q, self.tracker_to_image, self.blocks) * self.mask[..., None, None]
+        rows = np.asarray(motion(self.q, self.tracker_to_image, self.blocks))
+        rows = rows * self.mask[..., None, None]
         further = RIGID_UNKNOWNS
         # Further unknowns move the measured point instead of q.
         rows[..., 0, further:] = self.rows[..., 0, further:]
