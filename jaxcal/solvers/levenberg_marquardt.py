@@ -29,7 +29,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import fields
-from typing import Any, Self
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -116,7 +116,7 @@ class LoopState(Minimum):
     @classmethod
     def first(
         cls, start: Any, number: Float[Array, " batch"], damping: float, trace: int, **own: Any
-    ) -> Self:
+    ) -> Any:
         """The state before the first evaluation.
 
         Args:
