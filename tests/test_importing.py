@@ -614,7 +614,7 @@ def test_points_of_images_that_were_not_ok(tmp_path):
     (tmp_path / "p.csv").write_text(POINTS_OF_SIX)
     recording, notes, _ = import_files([path, tmp_path / "p.csv"])
     np.testing.assert_allclose(recording.calibration.poses, POSES[[0, 1, 2, 4, 5]], atol=1e-11)
-    assert "1 points left out: their frame's image was not OK" in notes
+    assert "1 point left out, in frames whose image was not OK" in notes
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from jaxcal import InputError, OutputError
-from jaxcal.cli.common import ExitCode, progress
+from jaxcal.cli.common import import_code, progress
 from jaxcal.cli.sequence_options import by_hand, search_options, table_options, tracking_options
 from jaxcal.io.atomic import check_writable
 from jaxcal.io.outputs import RECORDING, check_output, is_hdf5_recording, is_recording
@@ -81,7 +81,7 @@ def import_(sources: tuple[str, ...], out: str, add_to: str | None, **options: A
         click.echo(f"- {note}")
     for line in [] if frames is None else by_hand(sources[0], frames, options):
         click.echo(line)
-    return ExitCode.CONVERGED
+    return import_code(frames)
 
 
 def _check(sources: tuple[str, ...], out: str, add_to: str | None, options: dict[str, Any]) -> None:

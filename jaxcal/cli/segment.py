@@ -13,6 +13,7 @@ from jaxcal import InputError
 from jaxcal.cli.common import (
     POSITIVE,
     ExitCode,
+    import_code,
     import_engine,
     json_option,
     print_json,
@@ -181,9 +182,12 @@ def _segment_frames(source: str, out: str | None, as_json: bool, options: dict[s
     if as_json:
         print_json(_frames_record(target, recording, notes, found))
     else:
-        told = _frames_lines(target, recording, notes, found)
+        unscaled = recording.calibration.spacing_mm is None
+        hint = "; a pixel's size is not known: calibrate with --estimate scale" if unscaled else ""
+        count = f"{len(found.found)} of {len(found)} frames segmented ({found.target})"
+        told = (f"{target}: {count}{hint}", *(f"- {note}" for note in notes))
         print_page(*told, *by_hand(source, found, options))
-    return ExitCode.CONVERGED
+    return import_code(found)
 
 
 def _frames_record(
@@ -210,24 +214,6 @@ def _frames_record(
         ],
         "notes": notes,
     }
-
-
-def _frames_lines(
-    target: str, recording: Recording, notes: list[str], found: FrameResults
-) -> list[str]:
-    unscaled = recording.calibration.spacing_mm is None
-    hint = "; a pixel's size is not known: calibrate with --estimate scale" if unscaled else ""
-    counts = found.counts
-    first = f"{target}: {counts['found']} of {len(found)} frames segmented ({found.target}){hint}"
-    others = ", ".join(
-        f"{count} {name}" for name, count in counts.items() if count and name != "found"
-    )
-    return [
-        first,
-        *([f"- other frames: {others}"] if others else []),
-        *(f"- not credible: {count} x {why}" for why, count in found.reasons.items()),
-        *(f"- {note}" for note in notes if "left out" not in note),
-    ]
 
 
 def _probe(data: Recording, sound_speed: float | None, temperature: float | None) -> Probe | None:

@@ -27,6 +27,7 @@ from jaxcal.io.sources import SEQUENCES, kind_of, read_rows
 from jaxcal.io.target_search import FrameResults, search_target
 from jaxcal.io.text import read_crosswire, recording_of
 from jaxcal.runtime.array_types import Bool, Float, Int
+from jaxcal.runtime.messages import counted
 
 
 class Imported(NamedTuple):
@@ -228,7 +229,7 @@ def _usable_points(
     rows = placed.rows[order]
     tracked, shown = valid[rows], _shown(sequence, rows)
     notes = [
-        f"{int(lost.sum())} points left out: their frame's {what} was not OK"
+        f"{counted(int(lost.sum()), 'point')} left out, in frames whose {what} was not OK"
         for lost, what in ((~tracked, "tracking"), (tracked & ~shown, "image"))
         if lost.any()
     ]
@@ -311,11 +312,12 @@ def _found_points(sequence: TrackedSequence, results: FrameResults, minimum: int
             f"target, at least {minimum} are needed (most often: {most}); place the points "
             "by hand: jaxcal pick"
         )
-    notes = [f"{blank} frames left out: their image was not OK"] if blank else []
+    notes = []
+    if blank:
+        notes.append(f"{blank} of {len(results)} frames left out: their image was not OK")
     if hidden:
-        most = next(iter(results.reasons))
+        why = "; ".join(f"{reason}: {count}" for reason, count in results.reasons.items())
         notes.append(
-            f"{hidden} of {len(used) + hidden} frames left out: no credible target in them (most "
-            f"often: {most})"
+            f"{hidden} of {len(results)} frames left out: no credible target in them ({why})"
         )
     return FramePoints(used, results.position[used], "pixel", notes, results.covariance[used])

@@ -13,6 +13,11 @@ def shown(value: object) -> str:
     return quoted(value) if isinstance(value, str) else quoted(repr(value))[1:-1]
 
 
+def counted(count: int, noun: str) -> str:
+    """A number with its noun, of which the plural has an s: ``1 image``, ``2 images``."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
 def seconds(moment: float) -> str:
     """A time stamp, to the millisecond also where it counts from 1970, for a message."""
     return f"{moment:.3f} s"
