@@ -10,6 +10,8 @@ import socket
 import subprocess
 import sys
 import threading
+import time
+from contextlib import suppress
 from dataclasses import replace
 
 import h5py
@@ -675,6 +677,35 @@ def test_served_to_another_client():
             client.stop()
             stop.set()
             thread.join()
+
+
+@pytest.mark.parametrize(
+    ("frame", "options", "name"),
+    [("UsProbe", [], b"ImageToUsProbe"), ("UsProbe", ["--name", "Mine"], b"Mine")],
+)
+def test_served_by_the_name_of_the_recordings_frame(saved, frame, options, name):
+    saved.write_text(json.dumps(good_record() | {"pose_frames": {"from": frame, "to": "Tracker"}}))
+    received = []
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+
+    def listen():
+        try:
+            for _ in range(200):
+                with suppress(ConnectionRefusedError):
+                    with socket.create_connection(("127.0.0.1", port), 10) as link:
+                        received.append(link.recv(58, socket.MSG_WAITALL)[14:34].rstrip(b"\0"))
+                    return
+                time.sleep(0.02)
+        finally:
+            signal.raise_signal(signal.SIGINT)
+
+    listener = threading.Thread(target=listen)
+    listener.start()
+    assert main(["serve", str(saved), "--port", str(port), *options]) == 130
+    listener.join()
+    assert received == [name]
 
 
 @pytest.mark.parametrize("status", ["SUCCESS", "FAIL"])

@@ -19,8 +19,10 @@ from jaxcal.cli.common import POSITIVE, ExitCode
 @click.option(
     "--rate", type=POSITIVE, default=2.0, show_default=True, metavar="HZ", help="Messages a second."
 )
-@click.option("--name", default="ImageToProbe", show_default=True, help="Name of the transform.")
-def serve(calibration: str, host: str, port: int, rate: float, name: str) -> int:
+@click.option(
+    "--name", help="Name of the transform.  [default: ImageTo and the probe's frame, ImageToProbe]"
+)
+def serve(calibration: str, host: str, port: int, rate: float, name: str | None) -> int:
     """Serve the calibration CAL as an OpenIGTLink TRANSFORM until Ctrl-C.
 
     In Slicer's OpenIGTLinkIF, add a connector of type client for this host and port. The matrix is
@@ -31,6 +33,7 @@ def serve(calibration: str, host: str, port: int, rate: float, name: str) -> int
 
     transform = load_calibration(calibration)
     transform.check_usable()
+    name = f"ImageTo{transform.probe_frame}" if name is None else name
     with TransformServer(name, transform.plus_matrix(), host, port) as server:
         click.echo(f"{name} at {host}:{server.port}, {rate:g} times a second; Ctrl-C ends")
         server.serve(1 / rate)
