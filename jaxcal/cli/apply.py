@@ -10,6 +10,7 @@ import click
 from jaxcal import InputError
 from jaxcal.cli.common import NOT_NEGATIVE, ExitCode
 from jaxcal.cli.sequence_options import quaternion_option
+from jaxcal.runtime.messages import counted
 
 _COLUMNS = (
     "x_mm",
@@ -110,7 +111,7 @@ def apply(
     else:
         write_text(out, table.getvalue())
         frame = "probe" if poses is None else "tracker"
-        click.echo(f"{out}: {len(points)} points in the {frame}'s frame")
+        click.echo(f"{out}: {counted(len(points), 'point')} in the {frame}'s frame")
     return ExitCode.CONVERGED
 
 

@@ -11,6 +11,7 @@ from jaxcal.cli.common import import_code, progress
 from jaxcal.cli.sequence_options import by_hand, search_options, table_options, tracking_options
 from jaxcal.io.atomic import check_writable
 from jaxcal.io.outputs import RECORDING, check_output, is_hdf5_recording, is_recording
+from jaxcal.runtime.messages import counted
 
 
 @click.command("import")
@@ -68,7 +69,7 @@ def import_(sources: tuple[str, ...], out: str, add_to: str | None, **options: A
         save(recording, out, frames)
     else:
         added = len(recording)
-        notes = [f"{added} images added to the {len(first)} of {add_to}", *notes]
+        notes = [f"{counted(added, 'image')} added to the {len(first)} of {add_to}", *notes]
         if (first.calibration.covariance is None) != (recording.calibration.covariance is None):
             notes.append("covariances of the points are left out: only some images have them")
         recording = joined(first, recording)
@@ -76,7 +77,7 @@ def import_(sources: tuple[str, ...], out: str, add_to: str | None, **options: A
     images = recording.calibration
     unscaled = images.kind == "pixel" and images.spacing_mm is None
     hint = "; their size is not known: calibrate with --estimate scale" if unscaled else ""
-    click.echo(f"{out}: {len(images)} images, {images.kind}s{hint}")
+    click.echo(f"{out}: {counted(len(images), 'image')}, {images.kind}s{hint}")
     for note in notes:
         click.echo(f"- {note}")
     for line in [] if frames is None else by_hand(sources[0], frames, options):

@@ -27,6 +27,7 @@ from jaxcal.cli.sequence_options import (
     table_options,
     tracking_options,
 )
+from jaxcal.runtime.messages import counted
 
 if TYPE_CHECKING:
     from jaxcal.data.probe import Probe
@@ -250,12 +251,12 @@ def _print(record: dict[str, Any]) -> None:
     noise = "" if record["noise_mm"] is None else f", {record['noise_mm']:.3g} mm noise"
     lines = [
         f"{record['out']}: {record['images_used']} of {record['images']} images segmented "
-        f"({record['method']}); {record['missing_lines']} lines missing, "
+        f"({record['method']}); {counted(record['missing_lines'], 'line')} missing, "
         f"{record['rejected_lines']} rejected{noise}"
     ]
     if record["elevation_determined"] is not None:
         lines.append(
             f"distance from the image plane (without its sign) determined in "
-            f"{record['elevation_determined']} images"
+            f"{counted(record['elevation_determined'], 'image')}"
         )
     print_page(*lines, *(f"- {text}" for text in record["warnings"]))

@@ -13,6 +13,7 @@ import click
 
 from jaxcal import CalibrationError, InputError, MissingExtraError
 from jaxcal.cli.common import Commands, ExitCode, json_option, print_json, print_page
+from jaxcal.runtime.messages import counted
 
 if TYPE_CHECKING:
     from jaxcal.study.run import Watcher
@@ -76,8 +77,8 @@ def run(spec: str, out: str, resume: bool, workers: int | None, dask: str | None
         raise CalibrationError(f"{error}; {kept()}" if store.is_begun() else str(error)) from error
     rate = summary.trials / max(summary.seconds, 1e-9)
     click.echo(
-        f"{out}: {summary.chunks} chunks are done, {summary.computed} of them now "
-        f"({summary.trials} trials in {summary.seconds:.1f} s, {rate:.0f} a second)"
+        f"{out}: {counted(summary.chunks, 'chunk', 'is', 'are')} done, {summary.computed} of them "
+        f"now ({counted(summary.trials, 'trial')} in {summary.seconds:.1f} s, {rate:.0f} a second)"
     )
     return ExitCode.CONVERGED
 

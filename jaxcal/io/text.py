@@ -20,7 +20,7 @@ from jaxcal.io.columns import LENGTHS_MM, Columns, LengthUnit, columns_of_header
 from jaxcal.io.given_files import naming
 from jaxcal.io.table import Table, first_line, has_commented_header, parse_numbers, read_table
 from jaxcal.runtime.array_types import Float, Int
-from jaxcal.runtime.messages import quoted
+from jaxcal.runtime.messages import counted, quoted
 
 _LATEST_S = 1e11
 """Latest time, s after any beginning: three thousand years. Stamps in ms or ns are beyond it."""
@@ -85,7 +85,8 @@ class PoseTable:
     @property
     def notes(self) -> list[str]:
         """What was left out, in words."""
-        return [f"{self.name}: {self.skipped} invalid rows left out"] if self.skipped else []
+        rows = counted(self.skipped, "invalid row")
+        return [f"{self.name}: {rows} left out"] if self.skipped else []
 
 
 def read_pose_table(

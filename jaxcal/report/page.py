@@ -48,6 +48,7 @@ from jaxcal.result.calibration import Calibration
 from jaxcal.result.saved import transform_from_record
 from jaxcal.result.transform import SaveFormat
 from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.messages import counted
 
 MOST_POSES, MOST_PLANES = 300, 60
 """Most poses, and most image planes, that are drawn in space."""
@@ -593,7 +594,7 @@ def _in_unit(name: str, sd: float) -> str:
 
 def _facts(record: dict[str, Any]) -> str:
     rows = [
-        ("status", f"{record['status']} after {record['iterations']} iterations"),
+        ("status", f"{record['status']} after {counted(record['iterations'], 'iteration')}"),
         ("images", f"{record['images_used']} used of {record['images']}"),
         ("data", record["data"]),
         ("jaxcal", record["jaxcal_version"]),

@@ -11,6 +11,7 @@ from rich.table import Table
 
 from jaxcal.report.certified import certificate_words
 from jaxcal.report.verdict import spread_of_transform, title_of_transform
+from jaxcal.runtime.messages import counted
 
 _UNKNOWN = "-"
 _IN_OWN_UNITS = ("scale", "sound-speed", "delay")
@@ -69,7 +70,7 @@ def _facts(record: dict[str, Any]) -> list[tuple[str, str]]:
     facts = [
         *_accuracy(record),
         ("method", f"{record['method']}{prior}"),
-        ("status", f"{record['status']} after {record['iterations']} iterations"),
+        ("status", f"{record['status']} after {counted(record['iterations'], 'iteration')}"),
         ("images", f"{record['images_used']} used of {record['images']}"),
         *frames_and_target(record),
         (

@@ -13,9 +13,9 @@ def shown(value: object) -> str:
     return quoted(value) if isinstance(value, str) else quoted(repr(value))[1:-1]
 
 
-def counted(count: int, noun: str) -> str:
-    """A number with its noun, of which the plural has an s: ``1 image``, ``2 images``."""
-    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+def counted(count: int, noun: str, one: str = "", several: str = "") -> str:
+    """A number with its noun and verb, ``1 image is`` or ``2 images are``."""
+    return f"{count} {noun} {one}".rstrip() if count == 1 else f"{count} {noun}s {several}".rstrip()
 
 
 def seconds(moment: float) -> str:
