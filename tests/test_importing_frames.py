@@ -26,11 +26,13 @@ from jaxcal.cli.segment import _default_out
 from jaxcal.io.dicom import read_pixel_size
 from jaxcal.io.folder import read_folder
 from jaxcal.io.frame_poses import open_sequence
-from jaxcal.io.import_options import ImportOptions
 from jaxcal.io.importing import import_files
 from jaxcal.io.picker.picks import Picks
 from jaxcal.io.png import encode_png, png_size, read_png
+from jaxcal.io.poses_by_time import with_poses_by_time
+from jaxcal.io.sequence import TrackedSequence
 from jaxcal.io.sequence_files import read_sequence, write_sequence
+from jaxcal.io.sources import ImportOptions
 
 ROWS, COLUMNS, COUNT = 110, 150, 9
 PAIR = ("Probe", "Tracker")
@@ -535,6 +537,11 @@ def test_dates_are_not_matched_with_seconds(tmp_path, what, capsys):
     assert not out.exists()
 
 
+def tracked(times, poses) -> TrackedSequence:
+    good = np.ones(len(times), bool)
+    return TrackedSequence({PAIR: poses}, {PAIR: good}, times, ~good, source="t.mha")
+
+
 @pytest.mark.parametrize(
     ("times", "message"),
     [
@@ -548,11 +555,9 @@ def test_dates_are_not_matched_with_seconds(tmp_path, what, capsys):
     ],
 )
 def test_poses_of_other_times(tmp_path, times, message):
-    from jaxcal.io.poses_by_time import Tracking, with_poses_by_time
-
     write_sequence(tmp_path / "i.mha", {}, 100.3 + np.arange(COUNT) * 0.37, images=FRAMES)
     images = read_sequence(tmp_path / "i.mha")
-    tracking = Tracking(times, moving(MOMENTS), np.ones(200, bool), PAIR, "t.mha")
+    tracking = tracked(times, moving(MOMENTS))
     with pytest.raises(InputError, match=message):
         with_poses_by_time(images, tracking)
 
@@ -590,12 +595,10 @@ def test_times_of_poses_that_may_be_in_ms(tmp_path, named, unit, every, length, 
 
 
 def test_times_that_only_rounding_puts_beyond_the_poses_have_one(tmp_path):
-    from jaxcal.io.poses_by_time import Tracking, with_poses_by_time
-
     times = 100.3 + np.arange(COUNT) * 0.37
     write_sequence(tmp_path / "i.mha", {}, times, images=FRAMES)
     moments = np.linspace(times[0] + 1e-9, times[-1] - 1e-9, 200)
-    tracking = Tracking(moments, moving(moments), np.ones(200, bool), PAIR, "t.mha")
+    tracking = tracked(moments, moving(moments))
     found, notes = with_poses_by_time(read_sequence(tmp_path / "i.mha"), tracking)
     assert found.valid[PAIR].all()
     assert len(notes) == 1

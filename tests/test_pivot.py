@@ -13,8 +13,8 @@ import jaxcal
 from jaxcal import InputError
 from jaxcal.cli.main import main
 from jaxcal.io.frame_poses import tool_poses
-from jaxcal.io.import_options import ImportOptions
 from jaxcal.io.sequence_files import write_sequence
+from jaxcal.io.sources import ImportOptions
 from jaxcal.io.text import read_poses
 
 TIP, POINT = np.array([3.0, -20.0, 150.0]), np.array([100.0, -200.0, 900.0])

@@ -43,10 +43,10 @@ def pick(frames: str, picks: str | None, every: int, port: int, **options: Any) 
     """
     from jaxcal.io.atomic import check_writable
     from jaxcal.io.frame_poses import frames_to_show, open_sequence
-    from jaxcal.io.import_options import ImportOptions
     from jaxcal.io.picker.frames import Frames
     from jaxcal.io.picker.picks import Picks
     from jaxcal.io.picker.server import Picker
+    from jaxcal.io.sources import ImportOptions
 
     asked = ImportOptions(**options)
     name = Path(os.path.abspath(frames)).name

@@ -45,7 +45,7 @@ def pivot(poses: str, no_robust: bool, as_json: bool, **options: Any) -> int:
     from jaxcal.data.recording import MetresError
     from jaxcal.io.frame_poses import tool_poses
     from jaxcal.io.given_files import naming
-    from jaxcal.io.import_options import ImportOptions
+    from jaxcal.io.sources import ImportOptions
     from jaxcal.report.pivot import pivot_lines
     from jaxcal.runtime.jax_cache import enable_compilation_cache
 

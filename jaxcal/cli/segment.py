@@ -167,9 +167,9 @@ def _segment_frames(source: str, out: str | None, as_json: bool, options: dict[s
     """A sequence's frames; what became of each is counted and said."""
     from jaxcal.io.atomic import check_writable
     from jaxcal.io.hdf5 import save
-    from jaxcal.io.import_options import ImportOptions
     from jaxcal.io.importing import import_files
     from jaxcal.io.outputs import RECORDING, check_output, is_recording
+    from jaxcal.io.sources import ImportOptions
 
     target = _default_out(source) if out is None else out
     check_output(target, "a recording", is_recording, [source], endings=RECORDING)

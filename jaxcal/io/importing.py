@@ -20,10 +20,9 @@ from jaxcal import InputError
 from jaxcal.data.recording import MetresError, Recording, make_images
 from jaxcal.io.frame_points import FramePoints, points_of_markups, points_of_table
 from jaxcal.io.frame_poses import opened, tracked_poses
-from jaxcal.io.import_options import ImportOptions, refuse
-from jaxcal.io.poses_by_time import Tracking, lag_of_points, with_poses_by_time
+from jaxcal.io.poses_by_time import lag_of_points, with_poses_by_time
 from jaxcal.io.sequence import Pixels, TrackedSequence
-from jaxcal.io.sources import SEQUENCES, kind_of, read_rows
+from jaxcal.io.sources import SEQUENCES, ImportOptions, kind_of, read_rows, refuse
 from jaxcal.io.target_search import FrameResults, search_target
 from jaxcal.io.text import read_crosswire, recording_of
 from jaxcal.runtime.array_types import Bool, Float, Int
@@ -193,7 +192,7 @@ def _from_sequence(
 def _estimated_lag(
     sequence: TrackedSequence,
     placed: FramePoints | None,
-    tracking: Tracking,
+    tracking: TrackedSequence,
     options: ImportOptions,
 ) -> tuple[float, str, FrameResults | None]:
     """The lag and a note, and the target in all frames if it had to be looked for."""

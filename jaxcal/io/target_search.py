@@ -91,7 +91,7 @@ def search_target(
 ) -> FrameResults:
     """Look for the target in every frame that was tracked.
 
-    The options are those of :class:`jaxcal.io.import_options.ImportOptions`.
+    The options are those of :class:`jaxcal.io.sources.ImportOptions`.
 
     Raises:
         FormatError: pixels that cannot be read.
