@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
-
 import click
 
 from jaxcal import InputError
@@ -71,6 +68,7 @@ def apply(
 
     from jaxcal.io.atomic import write_text
     from jaxcal.io.outputs import begins_with, check_output
+    from jaxcal.io.table import csv_text
     from jaxcal.result.saved import load_calibration
 
     if (source is None) == (not pixel):
@@ -98,18 +96,16 @@ def apply(
             err=True,
         )
     applied = transform.apply(points, poses, pixel_sd_px=pixel_sd)
-    table = io.StringIO()
-    rows = csv.writer(table, lineterminator="\n")
     name, which = numbers or ("", [])
-    rows.writerow([*_COLUMNS, name] if which else _COLUMNS)
+    rows: list[tuple[object, ...]] = [(*_COLUMNS, name) if which else _COLUMNS]
     for k, (point, covariance) in enumerate(zip(applied.points, applied.covariance, strict=True)):
         values = [*point, *np.sqrt(np.diag(covariance)), *covariance[[0, 0, 1], [1, 2, 2]]]
         cells = [repr(float(value)) if np.isfinite(value) else "" for value in values]
-        rows.writerow([*cells, which[k]] if which else cells)
+        rows.append((*cells, which[k]) if which else tuple(cells))
     if out is None:
-        click.echo(table.getvalue(), nl=False)
+        click.echo(csv_text(rows), nl=False)
     else:
-        write_text(out, table.getvalue())
+        write_text(out, csv_text(rows))
         frame = "probe" if poses is None else "tracker"
         click.echo(f"{out}: {counted(len(points), 'point')} in the {frame}'s frame")
     return ExitCode.CONVERGED

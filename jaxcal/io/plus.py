@@ -10,7 +10,6 @@ Source: PlusLib, vtkPlusConfig and IGSIO's vtkIGSIOTransformRepository.
 from __future__ import annotations
 
 import datetime
-import math
 import os
 from typing import NamedTuple
 from xml.sax.saxutils import quoteattr
@@ -22,6 +21,7 @@ from jaxcal.data.poses import check_affine
 from jaxcal.io.atomic import write_bytes
 from jaxcal.io.frame_names import FramePair, capitalised, check_frames, path_between, split_name
 from jaxcal.io.given_files import naming
+from jaxcal.io.table import finite_numbers
 from jaxcal.io.xml import Element, parse_xml, read_xml
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.messages import quoted
@@ -130,21 +130,8 @@ def _attribute(element: Element, name: str) -> str:
 
 
 def _numbers(element: Element, name: str, count: int) -> Float[np.ndarray, " count"]:
-    text = _attribute(element, name)
-    try:
-        numbers = [float(part) for part in text.split()]
-    except ValueError:
-        raise FormatError(
-            f"line {element.line}: {name} of <{element.tag}> is not numbers: {quoted(text)}"
-        ) from None
-    if len(numbers) != count:
-        raise FormatError(
-            f"line {element.line}: {name} of <{element.tag}> has {len(numbers)} numbers, {count} "
-            "are needed"
-        )
-    if not all(map(math.isfinite, numbers)):
-        raise FormatError(f"line {element.line}: {name} of <{element.tag}> holds NaN or Inf")
-    return np.array(numbers)
+    what = f"line {element.line}: {name} of <{element.tag}>"
+    return finite_numbers(_attribute(element, name), count, what)
 
 
 def _optional_number(element: Element | None, name: str) -> float | None:
