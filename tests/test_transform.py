@@ -21,7 +21,7 @@ import pytest
 import jaxcal
 from jaxcal import FormatError, InputError
 from jaxcal.cli.main import main
-from jaxcal.data.poses import check_affine, quaternion_from_rotation, rotations_from_quaternions
+from jaxcal.data.poses import check_affine, quaternions_from_rotations, rotations_from_quaternions
 from jaxcal.io.itk import itk_from_matrix, itk_text, matrix_from_itk, read_itk, write_itk
 from jaxcal.io.ros import read_ros_yaml
 from jaxcal.io.sequence_files import write_sequence
@@ -559,7 +559,7 @@ def test_quaternions_there_and_back():
     for quaternion, rotation in zip(
         quaternions, rotations_from_quaternions(quaternions, "xyzw"), strict=True
     ):
-        found = quaternion_from_rotation(rotation)
+        found = quaternions_from_rotations(rotation[None])[0]
         assert min(np.abs(found - quaternion).max(), np.abs(found + quaternion).max()) < 1e-14
     first = rotations_from_quaternions(quaternions[:, [3, 0, 1, 2]], "wxyz")
     np.testing.assert_allclose(first, rotations_from_quaternions(quaternions, "xyzw"), atol=1e-14)
