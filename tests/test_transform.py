@@ -647,7 +647,7 @@ def test_apply_refuses_options_of_a_table_where_none_is_read(saved, tmp_path, ca
     rest = ["--pose-units", "m", "--quaternion", "wxyz", "--skip-invalid"]
     for source in (["--pixel", "1", "2"], [str(tmp_path / "rec.h5")]):
         assert main(["apply", str(saved), *source, *rest]) == 2
-        told = "--quaternion, --pose-units, --skip-invalid: for tables, but no table is read"
+        told = "--pose-units, --quaternion, --skip-invalid: for tables, but no table is read"
         assert told in capsys.readouterr().err
 
 

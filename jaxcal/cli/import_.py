@@ -8,7 +8,7 @@ import click
 
 from jaxcal import InputError, OutputError
 from jaxcal.cli.common import import_code, progress
-from jaxcal.cli.sequence_options import by_hand, search_options, table_options, tracking_options
+from jaxcal.cli.sequence_options import SEARCH, TABLES, TRACKING, by_hand, with_options
 from jaxcal.io.atomic import check_writable
 from jaxcal.io.outputs import RECORDING, check_output, is_hdf5_recording, is_recording
 from jaxcal.runtime.messages import counted
@@ -23,15 +23,15 @@ from jaxcal.runtime.messages import counted
     help="Unit of u and v in a table: px (lateral and axial pixel, the default) or mm (lateral "
     "position and range).",
 )
-@table_options
-@tracking_options
+@with_options(TABLES)
+@with_options(TRACKING)
 @click.option(
     "--points",
     type=click.Choice(["labels", "order"]),
     help="How points of Slicer belong to frames: by the number that ends each label, or one for "
     "each frame.",
 )
-@search_options
+@with_options(SEARCH)
 @click.option(
     "--add-to",
     type=click.Path(),

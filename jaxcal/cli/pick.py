@@ -10,15 +10,15 @@ from typing import Any
 import click
 
 from jaxcal.cli.common import ExitCode
-from jaxcal.cli.sequence_options import beside, given_options, table_options, tracking_options
+from jaxcal.cli.sequence_options import TABLES, TRACKING, beside, given_options, with_options
 from jaxcal.runtime.messages import counted
 
 
 @click.command(short_help="Place the target's point in each frame by a click.")
 @click.argument("frames", type=click.Path(), metavar="SOURCE")
 @click.argument("picks", type=click.Path(), metavar="[PICKS.csv]", required=False)
-@tracking_options
-@table_options
+@with_options(TRACKING)
+@with_options(TABLES)
 @click.option(
     "--every",
     type=click.IntRange(1),

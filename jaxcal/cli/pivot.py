@@ -15,7 +15,7 @@ from jaxcal.cli.common import (
     print_page,
     progress,
 )
-from jaxcal.cli.sequence_options import table_options
+from jaxcal.cli.sequence_options import TABLES, with_options
 
 
 @click.command()
@@ -27,7 +27,7 @@ from jaxcal.cli.sequence_options import table_options
     metavar="FRAME",
     help="Frame in which the pivot point does not move; by default Reference if it was tracked.",
 )
-@table_options
+@with_options(TABLES)
 @click.option(
     "--no-robust", is_flag=True, help="Use every pose, also those that do not fit the rest."
 )

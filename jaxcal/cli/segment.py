@@ -21,11 +21,12 @@ from jaxcal.cli.common import (
     progress,
 )
 from jaxcal.cli.sequence_options import (
+    SEARCH,
+    TABLES,
+    TRACKING,
     beside,
     by_hand,
-    search_options,
-    table_options,
-    tracking_options,
+    with_options,
 )
 from jaxcal.runtime.messages import counted
 
@@ -78,9 +79,9 @@ if TYPE_CHECKING:
     help="By default REC-segmented.h5, beside REC. If it is REC itself, REC is replaced, unless "
     "it is an acquisition with raw data.",
 )
-@tracking_options
-@search_options
-@table_options
+@with_options(TRACKING)
+@with_options(SEARCH)
+@with_options(TABLES)
 @json_option
 @click.pass_context
 def segment(

@@ -137,23 +137,16 @@ class _Bar:
         self._progress.console.print(f"jaxcal: note: {message}", soft_wrap=True)
 
 
-class _Lines:
-    """What is to be noted, on standard error; nobody is watching."""
-
-    def begin(self, trials: int, done: int) -> None:
-        pass
-
-    def advance(self, trials: int) -> None:
-        pass
-
-    def note(self, message: str) -> None:
-        click.echo(f"jaxcal: note: {message}", err=True)
-
-
 @contextmanager
 def _watching() -> Iterator[Watcher]:
     if sys.stderr is None or not sys.stderr.isatty():
-        yield _Lines()
+        from jaxcal.study.run import Silence
+
+        class Notes(Silence):
+            def note(self, message: str) -> None:
+                click.echo(f"jaxcal: note: {message}", err=True)
+
+        yield Notes()
         return
     from rich.console import Console
     from rich.progress import (
