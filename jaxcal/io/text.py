@@ -295,7 +295,7 @@ def _columns(table: Table, quaternion: QuaternionOrder | None) -> Columns:
     width = len(table.rows[0])
     if width in (15, 19):
         matrix = tuple(range(1, width - 2))
-        return Columns(width, matrix=matrix, time=0, point=(width - 2, width - 1))
+        return Columns(matrix=matrix, time=0, point=(width - 2, width - 1))
     if width != 10:
         hint = ", or a first line that names the columns"
         if width == 2:
@@ -312,7 +312,7 @@ def _columns(table: Table, quaternion: QuaternionOrder | None) -> Columns:
             "first or last (--quaternion wxyz or xyzw)"
         )
     order = (5, 6, 7, 4) if quaternion == "wxyz" else (4, 5, 6, 7)
-    return Columns(10, translation=(1, 2, 3), quaternion=order, time=0, point=(8, 9))
+    return Columns(translation=(1, 2, 3), quaternion=order, time=0, point=(8, 9))
 
 
 def _used_rows(table: Table, columns: Columns, skip_invalid: bool) -> tuple[list[int], int]:
