@@ -20,7 +20,8 @@ from jaxcal.cli.common import POSITIVE, ExitCode
     "--rate", type=POSITIVE, default=2.0, show_default=True, metavar="HZ", help="Messages a second."
 )
 @click.option(
-    "--name", help="Name of the transform.  [default: ImageTo and the probe's frame, ImageToProbe]"
+    "--name",
+    help="Name of the transform.  [default: ImageToProbe, or with the recording's name for Probe]",
 )
 def serve(calibration: str, host: str, port: int, rate: float, name: str | None) -> int:
     """Serve the calibration CAL as an OpenIGTLink TRANSFORM until Ctrl-C.
