@@ -78,7 +78,10 @@ def apply(
     points, poses, numbers = np.array(pixel), None, None
     if source is not None:
         points, poses, kind, numbers = _read(source, table)
-        _check_kind(kind, transform.scale_mm_per_px is not None, source)
+        pixels = transform.scale_mm_per_px is not None
+        if kind != ("pixel" if pixels else "point"):
+            wanted = "pixels" if pixels else "points in mm"
+            raise InputError(f"{source}: holds {kind} data, the calibration takes {wanted}")
     elif transform.scale_mm_per_px is None:
         click.echo(
             f"{calibration}: knows no pixel size, so --pixel takes points in mm: lateral, range",
@@ -134,9 +137,3 @@ def _read(source: str, options: dict[str, Any]):
     if of_poses and table.poses is None:
         raise click.UsageError(f"{of_poses}: for poses, but {source} holds none")
     return table.points, table.poses, table.kind, ("line", table.lines) if skipping else None
-
-
-def _check_kind(kind: str, pixels: bool, source: str) -> None:
-    if kind != ("pixel" if pixels else "point"):
-        wanted = "pixels" if pixels else "points in mm"
-        raise InputError(f"{source}: holds {kind} data, the calibration takes {wanted}")

@@ -72,7 +72,8 @@ def read_transform(
             elements = [each for place in root.all(_COORDINATES) for each in _transforms(place)]
         # All are looked at: a file with a damaged transform is not to be trusted.
         stated = [(_matrix(e), _frames(e), _optional_number(e, "Error"), e) for e in elements]
-        ends = {to for _, (start, to), *_ in stated if start == wanted[0] and not _inner(to)}
+        ends = {to for _, (start, to), *_ in stated if start == wanted[0]}
+        ends = {to for to in ends if not to.startswith("TransducerOrigin")}
         if target is None and len(ends) == 1:
             wanted = wanted[0], *ends
         for matrix, frames, error_mm, element in stated:
@@ -83,11 +84,6 @@ def read_transform(
                     error_mm = _optional_number(errors, "CalibrationMeanMm")
                 return PlusTransform(matrix, error_mm, frames[1])
         raise FormatError(f"holds no transform from {' to '.join(wanted)}")
-
-
-def _inner(frame: str) -> bool:
-    """Whether a frame is one of the transducer's, in the image (TransducerOriginPixel)."""
-    return frame.startswith("TransducerOrigin")
 
 
 def _check_root(root: Element) -> None:
