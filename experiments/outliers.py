@@ -1,6 +1,6 @@
 """Gross outliers: the robust solve against an oracle that knows which images are spoilt.
 
-A tenth and three tenths of the images are spoilt by 20 to 100 mm (``jaxcal.study.contamination``:
+A tenth and three tenths of the images are spoilt by 20 to 100 mm (``contamination``:
 wrong echo, wrong click, wrong pose, slipped mount), for three laws of the offsets and five cells of
 the paper's grid at n = 50; each kind by itself, and 12, 20 and 200 images, in the middle cell. Mean
 reconstruction precision of the robust solve (prior auto, points alone), of the same solve with the
@@ -29,11 +29,11 @@ from common import (
     save_figure,
     write_table,
 )
+from contamination import OutlierKind, contaminate
 from jaxtyping import Array
 
 from jaxcal import Protocol, calibrate_batch, simulate
 from jaxcal.runtime.jax_cache import enable_compilation_cache
-from jaxcal.study.contamination import OutlierKind, contaminate
 from jaxcal.study.offsets import OffsetLaw
 
 SEED = 20261126

@@ -203,7 +203,7 @@ BOMB = '<!DOCTYPE x [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a
         (b"<Other/>", "its root is 'Other'"),
         (
             configuration("<Transform From='A' To='B' Matrix='1 2 3'/>"),
-            ":7: Matrix of <Transform> has 3 numbers, 16",
+            ":7: Matrix of <Transform> must have 16 numbers, not 3",
         ),
         (configuration(OLD.replace("1 0 0 0 0", "nan 0 0 0 0")), "<Transform> holds NaN"),
         (configuration(OLD.replace("1 0 0 0 0", "1 x 0 0 0")), "is not numbers"),

@@ -83,12 +83,12 @@ def test_the_cache_is_warmed_shown_and_cleared(capsys, monkeypatch):
     assert row["bytes"] == shown["bytes"] > 1000
     page = command("show")
     assert "alternating" in page
-    assert "1 programs" in page
+    assert "1 program," in page
 
     program_cache.entries()[0].path.chmod(0o644)
     assert json.loads(command("show", "--json"))["programs"][0]["refused"]
     assert "refused" in command("show")
-    assert command("clear") == "1 programs removed\n"
+    assert command("clear") == "1 program removed\n"
     assert json.loads(command("show", "--json"))["programs"] == []
 
     monkeypatch.setenv("JAXCAL_NO_CACHE", "1")

@@ -149,7 +149,7 @@ def test_a_person_in_a_browser(tmp_path, sequence):
         hosts = addresses(browser)
     assert hosts <= {"127.0.0.1"}
     assert process.returncode == 0
-    assert f"{out}: 5 points, 1 frames skipped" in said
+    assert f"{out}: 5 points, 1 frame skipped" in said
     assert f"next: jaxcal import {sequence} {out} OUT.h5" in said
     table = np.loadtxt(out, delimiter=",", skiprows=3)
     np.testing.assert_array_equal(table[:, 0], [0, 1, 4, 5, 6])

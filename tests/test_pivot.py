@@ -13,8 +13,8 @@ import jaxcal
 from jaxcal import InputError
 from jaxcal.cli.main import main
 from jaxcal.io.frame_poses import tool_poses
-from jaxcal.io.import_options import ImportOptions
 from jaxcal.io.sequence_files import write_sequence
+from jaxcal.io.sources import ImportOptions
 from jaxcal.io.text import read_poses
 
 TIP, POINT = np.array([3.0, -20.0, 150.0]), np.array([100.0, -200.0, 900.0])
@@ -98,7 +98,7 @@ def test_poses_that_a_tracker_repeats_count_once(tmp_path, capsys):
     np.savetxt(path, np.repeat(poses, 2, axis=0).reshape(120, 16))
     assert main(["pivot", str(path)]) == 0
     said = capsys.readouterr().out
-    assert "60 poses repeat an earlier one exactly and are not used" in said
+    assert "60 poses repeat an earlier one exactly: not used" in said
     assert str(twice).split() == said.split()
     assert twice.record()["repeated"] == 60
     np.testing.assert_allclose(twice.record()["tip_mm"], TIP, atol=0.5)
@@ -218,7 +218,7 @@ def test_poses_of_a_tool_are_read_from_sequences_and_tables(tmp_path):
     table.write_text("\n".join(["x [m],y [m],z [m],qw,qx,qy,qz", *lines[:3], ",,,,,,", lines[4]]))
     read, notes = tool_poses(table, ImportOptions(skip_invalid=True))
     np.testing.assert_allclose(read, poses[[0, 1, 2, 4]], atol=1e-9)
-    assert notes == [f"{table}: 1 invalid rows left out"]
+    assert notes == [f"{table}: 1 invalid row left out"]
     table.write_text("\n".join(lines))
     read, _ = tool_poses(table, ImportOptions(quaternion="wxyz", pose_units="m"))
     np.testing.assert_allclose(read, poses, atol=1e-9)

@@ -284,6 +284,8 @@ def test_verdict_on_what_must_not_be_used(result, recording, status):
     lines = verdict(record)
     assert lines[0].startswith(("Do not use", "Do not trust"))
     assert "What to do:" in lines
+    # What tells the weakest direction, and what always helps, are not one request twice.
+    assert sum(line.count("20 to 30 degrees") for line in verdict(record | {"warnings": []})) <= 1
     assert record["warnings"]
     assert all(f"- {text}" in lines for text in record["warnings"])
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +17,10 @@ from jaxcal.cli.main import main
 from jaxcal.diagnostics.outliers import outlier_reasons, outliers
 from jaxcal.model.unknowns import RIGID
 from jaxcal.solvers.consensus import find_consensus, rigid_model
-from jaxcal.study.contamination import OUTLIER_KINDS, contaminate
+
+with pytest.MonkeyPatch.context() as patch:
+    patch.syspath_prepend(Path(__file__).parents[1] / "experiments")
+    from contamination import OUTLIER_KINDS, contaminate
 
 
 @pytest.fixture(scope="module")

@@ -33,10 +33,10 @@ from jaxcal.study.pipeline import (
     bound_mm,
     compile_pieces,
     compute_chunk,
-    numbers_of,
-    shape_of,
+    protocol,
 )
 from jaxcal.study.show import as_csv, as_record, mean_interval, summarise
+from jaxcal.study.simulation import join_protocol, split_protocol
 from jaxcal.study.spec import AXES, Spec, parse_spec
 from jaxcal.study.store import Store
 
@@ -220,8 +220,8 @@ def test_the_grid_is_counted_in_order():
 def test_every_law_can_be_simulated_in_a_study():
     laws = ", ".join(f'"{law}"' for law in OFFSET_LAWS)
     spec = parse_spec(f"{MINIMAL}[conditions]\nelevation_distribution = [{laws}]{METHOD}")
-    shapes = [shape_of(condition, spec.probe) for condition in spec.conditions()]
-    assert tuple(shape.law for shape in shapes) == OFFSET_LAWS
+    drawn = [protocol(condition, spec.probe) for condition in spec.conditions()]
+    assert tuple(each.elevation_distribution for each in drawn) == OFFSET_LAWS
 
 
 @pytest.mark.parametrize("law", OFFSET_LAWS)
@@ -307,8 +307,8 @@ def test_a_trial_is_that_of_the_public_functions(finished):
 
 def by_public_functions(spec, condition, indices):
     """The experiments of these trials, a whole block of them, and their problems."""
-    draw = drawing(shape_of(condition, spec.probe))
-    return draw(jnp.asarray(spec.seed), jnp.asarray(indices, np.uint32), numbers_of(condition))
+    shape, numbers = split_protocol(protocol(condition, spec.probe))
+    return drawing(shape)(jnp.asarray(spec.seed), jnp.asarray(indices, np.uint32), numbers)
 
 
 @functools.cache
@@ -316,7 +316,7 @@ def drawing(shape):
     @jax.jit
     def draw(seed, indices, numbers):
         keys = jax.vmap(lambda index: jax.random.fold_in(jax.random.key(seed), index))(indices)
-        drawn = jax.vmap(lambda key: jaxcal.simulate(key, shape.protocol(numbers)))(keys)
+        drawn = jax.vmap(lambda key: jaxcal.simulate(key, join_protocol(shape, numbers)))(keys)
         return drawn, jax.vmap(lambda experiment: experiment.problem())(drawn)
 
     return draw

@@ -10,6 +10,8 @@ import socket
 import subprocess
 import sys
 import threading
+import time
+from contextlib import suppress
 from dataclasses import replace
 
 import h5py
@@ -19,7 +21,7 @@ import pytest
 import jaxcal
 from jaxcal import FormatError, InputError
 from jaxcal.cli.main import main
-from jaxcal.data.poses import check_affine, quaternion_from_rotation, rotations_from_quaternions
+from jaxcal.data.poses import check_affine, quaternions_from_rotations, rotations_from_quaternions
 from jaxcal.io.itk import itk_from_matrix, itk_text, matrix_from_itk, read_itk, write_itk
 from jaxcal.io.ros import read_ros_yaml
 from jaxcal.io.sequence_files import write_sequence
@@ -557,7 +559,7 @@ def test_quaternions_there_and_back():
     for quaternion, rotation in zip(
         quaternions, rotations_from_quaternions(quaternions, "xyzw"), strict=True
     ):
-        found = quaternion_from_rotation(rotation)
+        found = quaternions_from_rotations(rotation[None])[0]
         assert min(np.abs(found - quaternion).max(), np.abs(found + quaternion).max()) < 1e-14
     first = rotations_from_quaternions(quaternions[:, [3, 0, 1, 2]], "wxyz")
     np.testing.assert_allclose(first, rotations_from_quaternions(quaternions, "xyzw"), atol=1e-14)
@@ -645,7 +647,7 @@ def test_apply_refuses_options_of_a_table_where_none_is_read(saved, tmp_path, ca
     rest = ["--pose-units", "m", "--quaternion", "wxyz", "--skip-invalid"]
     for source in (["--pixel", "1", "2"], [str(tmp_path / "rec.h5")]):
         assert main(["apply", str(saved), *source, *rest]) == 2
-        told = "--quaternion, --pose-units, --skip-invalid: for tables, but no table is read"
+        told = "--pose-units, --quaternion, --skip-invalid: for tables, but no table is read"
         assert told in capsys.readouterr().err
 
 
@@ -675,6 +677,35 @@ def test_served_to_another_client():
             client.stop()
             stop.set()
             thread.join()
+
+
+@pytest.mark.parametrize(
+    ("frame", "options", "name"),
+    [("UsProbe", [], b"ImageToUsProbe"), ("UsProbe", ["--name", "Mine"], b"Mine")],
+)
+def test_served_by_the_name_of_the_recordings_frame(saved, frame, options, name):
+    saved.write_text(json.dumps(good_record() | {"pose_frames": {"from": frame, "to": "Tracker"}}))
+    received = []
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+
+    def listen():
+        try:
+            for _ in range(200):
+                with suppress(ConnectionRefusedError):
+                    with socket.create_connection(("127.0.0.1", port), 10) as link:
+                        received.append(link.recv(58, socket.MSG_WAITALL)[14:34].rstrip(b"\0"))
+                    return
+                time.sleep(0.02)
+        finally:
+            signal.raise_signal(signal.SIGINT)
+
+    listener = threading.Thread(target=listen)
+    listener.start()
+    assert main(["serve", str(saved), "--port", str(port), *options]) == 130
+    listener.join()
+    assert received == [name]
 
 
 @pytest.mark.parametrize("status", ["SUCCESS", "FAIL"])

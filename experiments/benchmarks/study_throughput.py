@@ -141,8 +141,7 @@ def stage_times(canonical: str, repeats: int) -> dict[str, float]:
     spec = Spec.from_canonical(canonical)
     devices = tuple(jax.local_devices())
     condition = spec.condition(spec.condition_count - 1)
-    shape, size = pipeline.shape_of(condition, spec.probe), pipeline.BATCH_SIZE["cpu"]
-    given = shape.protocol(pipeline.numbers_of(condition))
+    given, size = pipeline.protocol(condition, spec.probe), pipeline.BATCH_SIZE["cpu"]
     indices = np.arange(size * pipeline.MOST_PIECES, dtype=np.uint32).reshape(-1, size)
     seed = np.asarray(spec.seed, np.uint64)
     block = pipeline.Block(spec, condition, indices, devices)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import csv
-import io
+from typing import Any
 
 import click
 
 from jaxcal import InputError
 from jaxcal.cli.common import NOT_NEGATIVE, ExitCode
-from jaxcal.cli.sequence_options import quaternion_option
+from jaxcal.cli.sequence_options import TABLES, with_options
+from jaxcal.runtime.messages import counted
 
 _COLUMNS = (
     "x_mm",
@@ -35,14 +35,7 @@ _COLUMNS = (
     metavar="PX",
     help="SD of the points in the image, px (mm without pixels).",
 )
-@quaternion_option
-@click.option("--pose-units", type=click.Choice(["mm", "cm", "m"]), help="Unit of translations.")
-@click.option(
-    "--skip-invalid",
-    is_flag=True,
-    help="Leave out rows of a table that are marked as invalid, have gaps or a pose of zeros; a "
-    "last column, line, then says which row is which.",
-)
+@with_options(TABLES)
 @click.option(
     "--out",
     type=click.Path(),
@@ -54,34 +47,29 @@ def apply(
     source: str | None,
     pixel: tuple[tuple[float, float], ...],
     pixel_sd: float,
-    quaternion,
-    pose_units,
-    skip_invalid: bool,
     out: str | None,
+    **table: Any,
 ) -> int:
     """Map image points by the calibration CAL; prints a table with standard deviations.
 
     SOURCE is a table with columns u and v, and a pose (probe to tracker) if points in the tracker's
     frame are wanted; or a recording (.h5). Standard deviations and covariances include those of the
     calibration (with estimated pixel sizes) and of --pixel-sd, but not those of the pose. Masked
-    images of a recording are left out; a last column, image, has the numbers of the others.
+    images of a recording are left out; a last column, image, has the numbers of the others. With
+    --skip-invalid a last column, line, says which row is which.
     """
     import numpy as np
 
     from jaxcal.io.atomic import write_text
     from jaxcal.io.outputs import begins_with, check_output
+    from jaxcal.io.table import csv_text
     from jaxcal.result.saved import load_calibration
 
     if (source is None) == (not pixel):
         raise click.UsageError("name SOURCE, or points by --pixel U V")
-    stated = {
-        "--quaternion": quaternion is not None,
-        "--pose-units": pose_units is not None,
-        "--skip-invalid": skip_invalid,
-    }
-    unused = [option for option, given in stated.items() if given]
-    if unused and (source is None or _is_recording(source)):
-        raise click.UsageError(f"{', '.join(unused)}: for tables, but no table is read")
+    given = _given(table)
+    if given and (source is None or _is_recording(source)):
+        raise click.UsageError(f"{given}: for tables, but no table is read")
     if out is not None:
         inputs = [calibration] if source is None else [calibration, source]
         check_output(out, "such a table", begins_with(",".join(_COLUMNS).encode()), inputs)
@@ -89,28 +77,29 @@ def apply(
     transform.check_usable()
     points, poses, numbers = np.array(pixel), None, None
     if source is not None:
-        points, poses, kind, numbers = _read(source, quaternion, pose_units, skip_invalid)
-        _check_kind(kind, transform.scale_mm_per_px is not None, source)
+        points, poses, kind, numbers = _read(source, table)
+        pixels = transform.scale_mm_per_px is not None
+        if kind != ("pixel" if pixels else "point"):
+            wanted = "pixels" if pixels else "points in mm"
+            raise InputError(f"{source}: holds {kind} data, the calibration takes {wanted}")
     elif transform.scale_mm_per_px is None:
         click.echo(
             f"{calibration}: knows no pixel size, so --pixel takes points in mm: lateral, range",
             err=True,
         )
     applied = transform.apply(points, poses, pixel_sd_px=pixel_sd)
-    table = io.StringIO()
-    rows = csv.writer(table, lineterminator="\n")
     name, which = numbers or ("", [])
-    rows.writerow([*_COLUMNS, name] if which else _COLUMNS)
+    rows: list[tuple[object, ...]] = [(*_COLUMNS, name) if which else _COLUMNS]
     for k, (point, covariance) in enumerate(zip(applied.points, applied.covariance, strict=True)):
         values = [*point, *np.sqrt(np.diag(covariance)), *covariance[[0, 0, 1], [1, 2, 2]]]
         cells = [repr(float(value)) if np.isfinite(value) else "" for value in values]
-        rows.writerow([*cells, which[k]] if which else cells)
+        rows.append((*cells, which[k]) if which else tuple(cells))
     if out is None:
-        click.echo(table.getvalue(), nl=False)
+        click.echo(csv_text(rows), nl=False)
     else:
-        write_text(out, table.getvalue())
+        write_text(out, csv_text(rows))
         frame = "probe" if poses is None else "tracker"
-        click.echo(f"{out}: {len(points)} points in the {frame}'s frame")
+        click.echo(f"{out}: {counted(len(points), 'point')} in the {frame}'s frame")
     return ExitCode.CONVERGED
 
 
@@ -118,7 +107,12 @@ def _is_recording(source: str) -> bool:
     return source.lower().endswith((".h5", ".hdf5"))
 
 
-def _read(source: str, quaternion, pose_units, skip_invalid: bool):
+def _given(options: dict[str, Any]) -> str:
+    """The options that were given, as they are typed."""
+    return ", ".join(f"--{name.replace('_', '-')}" for name, value in options.items() if value)
+
+
+def _read(source: str, options: dict[str, Any]):
     """Points, poses or None, the points' kind, and the images or lines that they are of."""
     if _is_recording(source):
         from jaxcal.io.hdf5 import load
@@ -135,19 +129,11 @@ def _read(source: str, quaternion, pose_units, skip_invalid: bool):
             f"{source}: holds frames or poses, but no points: import it with points (jaxcal "
             "import), and apply the calibration to the recording"
         )
-    table = read_pose_table(
-        source, quaternion=quaternion, pose_units=pose_units, skip_invalid=skip_invalid
-    )
+    table = read_pose_table(source, **options)
     if table.points is None:
         raise InputError(f"{source}: holds no points (columns u and v)")
-    of_poses = {"--quaternion": quaternion, "--pose-units": pose_units}
-    unused = [option for option, value in of_poses.items() if value is not None]
-    if unused and table.poses is None:
-        raise click.UsageError(f"{', '.join(unused)}: for poses, but {source} holds none")
-    return table.points, table.poses, table.kind, ("line", table.lines) if skip_invalid else None
-
-
-def _check_kind(kind: str, pixels: bool, source: str) -> None:
-    if kind != ("pixel" if pixels else "point"):
-        wanted = "pixels" if pixels else "points in mm"
-        raise InputError(f"{source}: holds {kind} data, the calibration takes {wanted}")
+    skipping = options["skip_invalid"]
+    of_poses = _given(options | {"skip_invalid": False})
+    if of_poses and table.poses is None:
+        raise click.UsageError(f"{of_poses}: for poses, but {source} holds none")
+    return table.points, table.poses, table.kind, ("line", table.lines) if skipping else None

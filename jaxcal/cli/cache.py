@@ -15,6 +15,7 @@ import click
 from jaxcal import InputError, OutputError
 from jaxcal.cli.common import Commands, ExitCode, json_option, print_json, print_page, progress
 from jaxcal.runtime import jax_cache, program_cache
+from jaxcal.runtime.messages import counted
 from jaxcal.solvers.names import Method
 
 if TYPE_CHECKING:
@@ -57,8 +58,9 @@ def show(as_json: bool) -> int:
         )
         return ExitCode.CONVERGED
     off = [] if program_cache.is_on() else [f"It is off: {program_cache.SWITCH} is set."]
-    said = f"{len(rows)} programs, {total / 2**20:.1f} of {program_cache.LIMIT_BYTES >> 20} MiB"
-    print_page(*([_table(rows)] if rows else []), f"{said}, in {folder}", *off)
+    size = f"{total / 2**20:.1f} of {program_cache.LIMIT_BYTES >> 20} MiB"
+    said = f"{counted(len(rows), 'program')}, {size}, in {folder}"
+    print_page(*([_table(rows)] if rows else []), said, *off)
     return ExitCode.CONVERGED
 
 
@@ -131,7 +133,7 @@ def clear() -> int:
         jax_cache.prune(jax_cache.folder(), 0)
     except (OSError, RuntimeError) as error:
         raise OutputError(f"the cache cannot be cleared: {error}") from error
-    print_page(f"{removed} programs removed")
+    print_page(f"{counted(removed, 'program')} removed")
     return ExitCode.CONVERGED
 
 

@@ -206,6 +206,7 @@ def calibrate(
         check_request,
         unknown_names,
     )
+    from jaxcal.calibration.calibrate import calibrate as solve
     from jaxcal.solvers.plan import Options
 
     alternation = {
@@ -215,6 +216,7 @@ def calibrate(
     }
     chosen = {name: value for name, value in alternation.items() if value is not None}
     check_alternation(["--" + name.replace("_", "-") for name in chosen], method)
+    options = Options(**chosen, solver=solver or "lm")
     request = Request(
         method,
         prior,
@@ -222,7 +224,7 @@ def calibrate(
         sigma,
         estimate=unknown_names(estimate),
         data=data,
-        options=Options(**chosen, solver=solver or "lm"),
+        options=options,
         robust=robust,
     )
     check_request(request)
@@ -230,6 +232,7 @@ def calibrate(
     from jaxcal.io.given_files import naming
     from jaxcal.io.hdf5 import load
     from jaxcal.report.accuracy import settle
+    from jaxcal.report.convergence import KEPT
     from jaxcal.report.next_poses import next_poses_record
     from jaxcal.report.record import calibration_record, check_test_images
     from jaxcal.report.write import prepare_folder, write_report
@@ -239,8 +242,7 @@ def calibrate(
     measured, notes = segmented(load(recording))
     test_data = None if test is None else segmented(load(test))[0]
     check_test_images(measured, test_data)
-    _check_pixels(measured, targets)
-    _check_configurations(measured, targets, inputs)
+    _check_exports(measured, targets, inputs)
     enable_compilation_cache()
     with nullcontext() if out is None else prepare_folder(out) as folder:
         if report is not None:
@@ -249,9 +251,11 @@ def calibrate(
             # The page may be wanted in the report's folder, which is there from now on.
             check_page(report, inputs)
         with progress(f"calibrating ({method})") as show:
-            traced = folder is not None and method == "conventional"
+            asked = request
+            if folder is not None and method == "conventional":
+                asked = replace(request, options=replace(options, trace=KEPT))
             with _first_answer(measured, request, show), naming(recording):
-                result = _solve(measured, request, traced=traced)
+                result = solve(measured, **vars(asked))
             record = calibration_record(result, measured, test_data, tre_points)
             record["warnings"] += notes
             record["next_poses"] = next_poses_record(result, measured, cone)
@@ -312,29 +316,23 @@ def _check_apart(
         taken.append(place)
 
 
-def _check_pixels(recording: Recording, targets: list[tuple[SaveFormat, str]]) -> None:
-    """Refuse exports that need the size of a pixel, where only points in mm were recorded."""
-    from jaxcal.result.saved import needs_pixels
+def _check_exports(
+    recording: Recording, targets: list[tuple[SaveFormat, str]], inputs: list[str]
+) -> None:
+    """Refuse exports that need the size of a pixel, where only points in mm were recorded.
 
-    if recording.calibration.kind == "pixel":
-        return
+    And configurations of PLUS that cannot take the transform to the recording's probe.
+    """
+    from jaxcal.cli.export import check_configuration
+    from jaxcal.result.saved import needs_pixels, probe_frame
+
+    frames = "Image", probe_frame((recording.pose_frames or (None,))[0])
     for format, path in targets:
-        if needs_pixels(path, format):
+        if recording.calibration.kind != "pixel" and needs_pixels(path, format):
             raise InputError(
                 f"--export {format}:{path}: {recording.source} holds no pixels, but this format "
                 "needs their size: calibrate with --out, then jaxcal export with --pixel-size"
             )
-
-
-def _check_configurations(
-    recording: Recording, targets: list[tuple[SaveFormat, str]], inputs: list[str]
-) -> None:
-    """Refuse configurations of PLUS that cannot take the transform to the recording's probe."""
-    from jaxcal.cli.export import check_configuration
-    from jaxcal.result.saved import probe_frame
-
-    frames = "Image", probe_frame((recording.pose_frames or (None,))[0])
-    for format, path in targets:
         if format == "plus":
             check_configuration(path, None, inputs, frames)
 
@@ -358,18 +356,6 @@ def _export(
         else:
             said += written(transform, path, format)
     return said
-
-
-def _solve(recording: Recording, request: Request, *, traced: bool) -> Calibration:
-    from jaxcal.calibration.calibrate import calibrate as solve
-
-    arguments: dict[str, Any] = dict(vars(request))
-    if traced:
-        from jaxcal.report.convergence import KEPT
-        from jaxcal.solvers.plan import Options
-
-        arguments["options"] = replace(request.options or Options(), trace=KEPT)
-    return solve(recording, **arguments)
 
 
 @contextmanager

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from jaxcal.data.recording import Recording
+    from jaxcal.io.target_search import FrameResults
 
 
 class ExitCode(enum.IntEnum):
@@ -31,7 +32,7 @@ class ExitCode(enum.IntEnum):
 
     Only an acquisition ends with 4: stopped early, by a device or a person, and to be resumed. 5 is
     a calibration that converged and is less accurate than was required (fair, if not told
-    otherwise).
+    otherwise). An import that had to leave out most frames ends with 3.
     """
 
     CONVERGED = 0
@@ -110,6 +111,12 @@ def exit_code(records: Iterable[dict[str, Any]]) -> ExitCode:
     """0 where every calibration converged, on data in the right frames; else 3."""
     converged = all(record["converged"] and not record.get("wrong_frames") for record in records)
     return ExitCode.CONVERGED if converged else ExitCode.NOT_CONVERGED
+
+
+def import_code(frames: FrameResults | None) -> ExitCode:
+    """3 where the target was looked for in frames, and most of them had to be left out."""
+    lost = frames is not None and frames.most_lost
+    return ExitCode.NOT_CONVERGED if lost else ExitCode.CONVERGED
 
 
 WORDS = ("good", "fair", "uncertain")

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from jaxcal.cli.common import POSITIVE, ExitCode, Server
+from jaxcal.cli.sequence_options import with_options
 
 if TYPE_CHECKING:
     from jaxcal.result.transform import ImageTransform, SaveFormat
@@ -27,15 +28,6 @@ _NAMELESS = ("slicer", "itk", "tusrec", "numpy")
 """Formats without names of frames."""
 
 
-def _formats(command):
-    for name, text in reversed(_TEXTS.items()):
-        option = click.option(
-            f"--{name}", "format", flag_value=name, help=text, callback=_one_format, multiple=True
-        )
-        command = option(command)
-    return command
-
-
 def _one_format(_: click.Context, __: click.Parameter, given: tuple[str, ...]) -> str | None:
     """The one format that was asked for."""
     if len(given) > 1:
@@ -44,10 +36,18 @@ def _one_format(_: click.Context, __: click.Parameter, given: tuple[str, ...]) -
     return given[0] if given else None
 
 
+_FORMATS = tuple(
+    click.option(
+        f"--{name}", "format", flag_value=name, help=text, callback=_one_format, multiple=True
+    )
+    for name, text in _TEXTS.items()
+)
+
+
 @click.command(short_help="Write a calibration for PLUS, Slicer, ITK, ROS or numpy.")
 @click.argument("calibration", type=click.Path(), metavar="CAL")
 @click.argument("out", type=click.Path(), metavar="[OUT]", required=False)
-@_formats
+@with_options(_FORMATS)
 @click.option(
     "--plus-config",
     type=click.Path(),

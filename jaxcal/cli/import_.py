@@ -7,10 +7,11 @@ from typing import Any
 import click
 
 from jaxcal import InputError, OutputError
-from jaxcal.cli.common import ExitCode, progress
-from jaxcal.cli.sequence_options import by_hand, search_options, table_options, tracking_options
+from jaxcal.cli.common import import_code, progress
+from jaxcal.cli.sequence_options import SEARCH, TABLES, TRACKING, by_hand, with_options
 from jaxcal.io.atomic import check_writable
 from jaxcal.io.outputs import RECORDING, check_output, is_hdf5_recording, is_recording
+from jaxcal.runtime.messages import counted
 
 
 @click.command("import")
@@ -22,15 +23,15 @@ from jaxcal.io.outputs import RECORDING, check_output, is_hdf5_recording, is_rec
     help="Unit of u and v in a table: px (lateral and axial pixel, the default) or mm (lateral "
     "position and range).",
 )
-@table_options
-@tracking_options
+@with_options(TABLES)
+@with_options(TRACKING)
 @click.option(
     "--points",
     type=click.Choice(["labels", "order"]),
     help="How points of Slicer belong to frames: by the number that ends each label, or one for "
     "each frame.",
 )
-@search_options
+@with_options(SEARCH)
 @click.option(
     "--add-to",
     type=click.Path(),
@@ -51,8 +52,8 @@ def import_(sources: tuple[str, ...], out: str, add_to: str | None, **options: A
     _check(sources, out, add_to, options)
     from jaxcal.data.recording import MINIMUM_IMAGES, joined
     from jaxcal.io.hdf5 import load, save
-    from jaxcal.io.import_options import ImportOptions
     from jaxcal.io.importing import import_files
+    from jaxcal.io.sources import ImportOptions
 
     first = None if add_to is None else load(add_to)
     with progress("importing"):
@@ -68,7 +69,7 @@ def import_(sources: tuple[str, ...], out: str, add_to: str | None, **options: A
         save(recording, out, frames)
     else:
         added = len(recording)
-        notes = [f"{added} images added to the {len(first)} of {add_to}", *notes]
+        notes = [f"{counted(added, 'image')} added to the {len(first)} of {add_to}", *notes]
         if (first.calibration.covariance is None) != (recording.calibration.covariance is None):
             notes.append("covariances of the points are left out: only some images have them")
         recording = joined(first, recording)
@@ -76,12 +77,12 @@ def import_(sources: tuple[str, ...], out: str, add_to: str | None, **options: A
     images = recording.calibration
     unscaled = images.kind == "pixel" and images.spacing_mm is None
     hint = "; their size is not known: calibrate with --estimate scale" if unscaled else ""
-    click.echo(f"{out}: {len(images)} images, {images.kind}s{hint}")
+    click.echo(f"{out}: {counted(len(images), 'image')}, {images.kind}s{hint}")
     for note in notes:
         click.echo(f"- {note}")
     for line in [] if frames is None else by_hand(sources[0], frames, options):
         click.echo(line)
-    return ExitCode.CONVERGED
+    return import_code(frames)
 
 
 def _check(sources: tuple[str, ...], out: str, add_to: str | None, options: dict[str, Any]) -> None:

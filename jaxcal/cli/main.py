@@ -32,7 +32,8 @@ from jaxcal.cli.study import study
     no_args_is_help=False,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
     epilog="Exit status: 0 converged; 2 bad usage or input, with one line that says what; "
-    "3 solved, but not converged or not determined by the images; 5 less accurate than required.",
+    "3 solved, but not converged or not determined by the images, or imported without most of the "
+    "frames; 5 less accurate than required.",
 )
 @click.version_option(__version__, prog_name="jaxcal")
 def commands() -> None:

@@ -10,14 +10,15 @@ from typing import Any
 import click
 
 from jaxcal.cli.common import ExitCode
-from jaxcal.cli.sequence_options import beside, given_options, table_options, tracking_options
+from jaxcal.cli.sequence_options import TABLES, TRACKING, beside, given_options, with_options
+from jaxcal.runtime.messages import counted
 
 
 @click.command(short_help="Place the target's point in each frame by a click.")
 @click.argument("frames", type=click.Path(), metavar="SOURCE")
 @click.argument("picks", type=click.Path(), metavar="[PICKS.csv]", required=False)
-@tracking_options
-@table_options
+@with_options(TRACKING)
+@with_options(TABLES)
 @click.option(
     "--every",
     type=click.IntRange(1),
@@ -42,10 +43,10 @@ def pick(frames: str, picks: str | None, every: int, port: int, **options: Any) 
     """
     from jaxcal.io.atomic import check_writable
     from jaxcal.io.frame_poses import frames_to_show, open_sequence
-    from jaxcal.io.import_options import ImportOptions
     from jaxcal.io.picker.frames import Frames
     from jaxcal.io.picker.picks import Picks
     from jaxcal.io.picker.server import Picker
+    from jaxcal.io.sources import ImportOptions
 
     asked = ImportOptions(**options)
     name = Path(os.path.abspath(frames)).name
@@ -61,7 +62,7 @@ def pick(frames: str, picks: str | None, every: int, port: int, **options: Any) 
         click.echo(f"- {note}")
     with Picker(placed, pictures, name, port) as page:
         try:
-            click.echo(f"{len(shown)} frames to show; open {page.url}")
+            click.echo(f"{counted(len(shown), 'frame')} to show; open {page.url}")
             click.echo("to end: Finish on the page, or Ctrl-C; every click is saved")
             while not page.wait(0.5):
                 pass
@@ -77,7 +78,7 @@ def _tell(placed: Any, source: str, out: str, options: dict[str, Any]) -> None:
         click.echo(f"no points; {out} was not made")
         return
     click.echo(
-        f"{out}: {count} points, {len(placed.skipped)} frames skipped"
+        f"{out}: {counted(count, 'point')}, {counted(len(placed.skipped), 'frame')} skipped"
         + (f", {left} still to do (the same command continues)" if left else "")
     )
     if count:

@@ -15,7 +15,7 @@ from jaxcal.cli.common import (
     print_page,
     progress,
 )
-from jaxcal.cli.sequence_options import table_options
+from jaxcal.cli.sequence_options import TABLES, with_options
 
 
 @click.command()
@@ -27,7 +27,7 @@ from jaxcal.cli.sequence_options import table_options
     metavar="FRAME",
     help="Frame in which the pivot point does not move; by default Reference if it was tracked.",
 )
-@table_options
+@with_options(TABLES)
 @click.option(
     "--no-robust", is_flag=True, help="Use every pose, also those that do not fit the rest."
 )
@@ -45,7 +45,7 @@ def pivot(poses: str, no_robust: bool, as_json: bool, **options: Any) -> int:
     from jaxcal.data.recording import MetresError
     from jaxcal.io.frame_poses import tool_poses
     from jaxcal.io.given_files import naming
-    from jaxcal.io.import_options import ImportOptions
+    from jaxcal.io.sources import ImportOptions
     from jaxcal.report.pivot import pivot_lines
     from jaxcal.runtime.jax_cache import enable_compilation_cache
 

@@ -13,6 +13,7 @@ from jaxcal import InputError
 from jaxcal.cli.common import (
     POSITIVE,
     ExitCode,
+    import_code,
     import_engine,
     json_option,
     print_json,
@@ -20,12 +21,14 @@ from jaxcal.cli.common import (
     progress,
 )
 from jaxcal.cli.sequence_options import (
+    SEARCH,
+    TABLES,
+    TRACKING,
     beside,
     by_hand,
-    search_options,
-    table_options,
-    tracking_options,
+    with_options,
 )
+from jaxcal.runtime.messages import counted
 
 if TYPE_CHECKING:
     from jaxcal.data.probe import Probe
@@ -76,9 +79,9 @@ if TYPE_CHECKING:
     help="By default REC-segmented.h5, beside REC. If it is REC itself, REC is replaced, unless "
     "it is an acquisition with raw data.",
 )
-@tracking_options
-@search_options
-@table_options
+@with_options(TRACKING)
+@with_options(SEARCH)
+@with_options(TABLES)
 @json_option
 @click.pass_context
 def segment(
@@ -165,9 +168,9 @@ def _segment_frames(source: str, out: str | None, as_json: bool, options: dict[s
     """A sequence's frames; what became of each is counted and said."""
     from jaxcal.io.atomic import check_writable
     from jaxcal.io.hdf5 import save
-    from jaxcal.io.import_options import ImportOptions
     from jaxcal.io.importing import import_files
     from jaxcal.io.outputs import RECORDING, check_output, is_recording
+    from jaxcal.io.sources import ImportOptions
 
     target = _default_out(source) if out is None else out
     check_output(target, "a recording", is_recording, [source], endings=RECORDING)
@@ -181,9 +184,12 @@ def _segment_frames(source: str, out: str | None, as_json: bool, options: dict[s
     if as_json:
         print_json(_frames_record(target, recording, notes, found))
     else:
-        told = _frames_lines(target, recording, notes, found)
+        unscaled = recording.calibration.spacing_mm is None
+        hint = "; a pixel's size is not known: calibrate with --estimate scale" if unscaled else ""
+        count = f"{len(found.found)} of {len(found)} frames segmented ({found.target})"
+        told = (f"{target}: {count}{hint}", *(f"- {note}" for note in notes))
         print_page(*told, *by_hand(source, found, options))
-    return ExitCode.CONVERGED
+    return import_code(found)
 
 
 def _frames_record(
@@ -210,24 +216,6 @@ def _frames_record(
         ],
         "notes": notes,
     }
-
-
-def _frames_lines(
-    target: str, recording: Recording, notes: list[str], found: FrameResults
-) -> list[str]:
-    unscaled = recording.calibration.spacing_mm is None
-    hint = "; a pixel's size is not known: calibrate with --estimate scale" if unscaled else ""
-    counts = found.counts
-    first = f"{target}: {counts['found']} of {len(found)} frames segmented ({found.target}){hint}"
-    others = ", ".join(
-        f"{count} {name}" for name, count in counts.items() if count and name != "found"
-    )
-    return [
-        first,
-        *([f"- other frames: {others}"] if others else []),
-        *(f"- not credible: {count} x {why}" for why, count in found.reasons.items()),
-        *(f"- {note}" for note in notes if "left out" not in note),
-    ]
 
 
 def _probe(data: Recording, sound_speed: float | None, temperature: float | None) -> Probe | None:
@@ -264,12 +252,12 @@ def _print(record: dict[str, Any]) -> None:
     noise = "" if record["noise_mm"] is None else f", {record['noise_mm']:.3g} mm noise"
     lines = [
         f"{record['out']}: {record['images_used']} of {record['images']} images segmented "
-        f"({record['method']}); {record['missing_lines']} lines missing, "
+        f"({record['method']}); {counted(record['missing_lines'], 'line')} missing, "
         f"{record['rejected_lines']} rejected{noise}"
     ]
     if record["elevation_determined"] is not None:
         lines.append(
             f"distance from the image plane (without its sign) determined in "
-            f"{record['elevation_determined']} images"
+            f"{counted(record['elevation_determined'], 'image')}"
         )
     print_page(*lines, *(f"- {text}" for text in record["warnings"]))

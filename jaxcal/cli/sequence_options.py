@@ -44,7 +44,7 @@ class _Lag(click.ParamType):
 probe_frame_option = click.option(
     "--from", "source", metavar="FRAME", help="Tracked frame on the probe, e.g. Probe."
 )
-_TRACKING = (
+TRACKING = (
     probe_frame_option,
     click.option(
         "--to",
@@ -77,25 +77,25 @@ _TRACKING = (
         help="Orientation of the frames, if their file does not say it.",
     ),
 )
-quaternion_option = click.option(
-    "--quaternion",
-    type=click.Choice(["xyzw", "wxyz"]),
-    help="Whether a quaternion's scalar is the last or the first of its numbers.",
-)
-_TABLES = (
+"""Which poses the frames have."""
+TABLES = (
     click.option(
         "--pose-units",
         type=click.Choice(["mm", "cm", "m"]),
         help="Unit of translations if the file of the poses does not say it; mm by default.",
     ),
-    quaternion_option,
+    click.option(
+        "--quaternion",
+        type=click.Choice(["xyzw", "wxyz"]),
+        help="Whether a quaternion's scalar is the last or the first of its numbers.",
+    ),
     click.option(
         "--skip-invalid",
         is_flag=True,
-        help="Leave out, and count, rows of tables that are marked as invalid, have gaps or a pose "
-        "of zeros.",
+        help="Leave out rows of tables that are marked as invalid, have gaps or a pose of zeros.",
     ),
 )
+"""How tables of poses are read."""
 spacing_option = click.option(
     "--spacing",
     "spacing_mm",
@@ -111,7 +111,7 @@ region_option = click.option(
     metavar="COLUMN ROW COLUMNS ROWS",
     help="Part of the frames to look in, px: its first column and row, and its size.",
 )
-_SEARCH = (
+SEARCH = (
     click.option(
         "--target",
         "target_kind",
@@ -133,21 +133,18 @@ _SEARCH = (
         help="If times repeat, go back or are missing, import without them.",
     ),
 )
+"""What to look for, where, and how large a pixel is."""
 
 
-def tracking_options(command: Command) -> Command:
-    """Add the options that say which poses the frames have."""
-    return _with(command, _TRACKING)
+def with_options(options: tuple[Callable[[Command], Command], ...]) -> Callable[[Command], Command]:
+    """A decorator that adds options to a command, in their order."""
 
+    def decorated(command: Command) -> Command:
+        for option in reversed(options):
+            command = option(command)
+        return command
 
-def table_options(command: Command) -> Command:
-    """Add the options that say how tables of poses are read."""
-    return _with(command, _TABLES)
-
-
-def search_options(command: Command) -> Command:
-    """Add the options that say what to look for, where, and how large a pixel is."""
-    return _with(command, _SEARCH)
+    return decorated
 
 
 def given_options(options: dict[str, Any], *, orientation: bool = False) -> list[str]:
@@ -192,9 +189,3 @@ def beside(frames: str, ending: str) -> str:
         path = Path(os.path.abspath(frames))
     name = path.name if path.is_dir() else _EXTENSION.sub("", path.name)
     return str(path.with_name(name + ending))
-
-
-def _with(command: Command, options: tuple[Callable[[Command], Command], ...]) -> Command:
-    for option in reversed(options):
-        command = option(command)
-    return command

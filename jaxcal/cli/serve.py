@@ -19,8 +19,11 @@ from jaxcal.cli.common import POSITIVE, ExitCode
 @click.option(
     "--rate", type=POSITIVE, default=2.0, show_default=True, metavar="HZ", help="Messages a second."
 )
-@click.option("--name", default="ImageToProbe", show_default=True, help="Name of the transform.")
-def serve(calibration: str, host: str, port: int, rate: float, name: str) -> int:
+@click.option(
+    "--name",
+    help="Name of the transform.  [default: ImageToProbe, or with the recording's name for Probe]",
+)
+def serve(calibration: str, host: str, port: int, rate: float, name: str | None) -> int:
     """Serve the calibration CAL as an OpenIGTLink TRANSFORM until Ctrl-C.
 
     In Slicer's OpenIGTLinkIF, add a connector of type client for this host and port. The matrix is
@@ -31,6 +34,7 @@ def serve(calibration: str, host: str, port: int, rate: float, name: str) -> int
 
     transform = load_calibration(calibration)
     transform.check_usable()
+    name = f"ImageTo{transform.probe_frame}" if name is None else name
     with TransformServer(name, transform.plus_matrix(), host, port) as server:
         click.echo(f"{name} at {host}:{server.port}, {rate:g} times a second; Ctrl-C ends")
         server.serve(1 / rate)

@@ -13,6 +13,7 @@ import click
 
 from jaxcal import CalibrationError, InputError, MissingExtraError
 from jaxcal.cli.common import Commands, ExitCode, json_option, print_json, print_page
+from jaxcal.runtime.messages import counted
 
 if TYPE_CHECKING:
     from jaxcal.study.run import Watcher
@@ -76,8 +77,8 @@ def run(spec: str, out: str, resume: bool, workers: int | None, dask: str | None
         raise CalibrationError(f"{error}; {kept()}" if store.is_begun() else str(error)) from error
     rate = summary.trials / max(summary.seconds, 1e-9)
     click.echo(
-        f"{out}: {summary.chunks} chunks are done, {summary.computed} of them now "
-        f"({summary.trials} trials in {summary.seconds:.1f} s, {rate:.0f} a second)"
+        f"{out}: {counted(summary.chunks, 'chunk', 'is', 'are')} done, {summary.computed} of them "
+        f"now ({counted(summary.trials, 'trial')} in {summary.seconds:.1f} s, {rate:.0f} a second)"
     )
     return ExitCode.CONVERGED
 
@@ -136,23 +137,16 @@ class _Bar:
         self._progress.console.print(f"jaxcal: note: {message}", soft_wrap=True)
 
 
-class _Lines:
-    """What is to be noted, on standard error; nobody is watching."""
-
-    def begin(self, trials: int, done: int) -> None:
-        pass
-
-    def advance(self, trials: int) -> None:
-        pass
-
-    def note(self, message: str) -> None:
-        click.echo(f"jaxcal: note: {message}", err=True)
-
-
 @contextmanager
 def _watching() -> Iterator[Watcher]:
     if sys.stderr is None or not sys.stderr.isatty():
-        yield _Lines()
+        from jaxcal.study.run import Silence
+
+        class Notes(Silence):
+            def note(self, message: str) -> None:
+                click.echo(f"jaxcal: note: {message}", err=True)
+
+        yield Notes()
         return
     from rich.console import Console
     from rich.progress import (

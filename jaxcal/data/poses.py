@@ -210,11 +210,6 @@ def rotations_from_vectors(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarr
     return np.eye(3) + first * cross + second * cross @ cross
 
 
-def quaternion_from_rotation(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 4"]:
-    """Unit quaternion x y z w (scalar last, not negative) of a rotation matrix."""
-    return quaternions_from_rotations(np.asarray(rotation, dtype=np.float64)[None])[0]
-
-
 def quaternions_from_rotations(rotations: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 4"]:
     """Unit quaternions x y z w (scalar last, not negative) of rotation matrices.
 

@@ -21,7 +21,7 @@ from jaxcal.data.sound import WATER_M_S
 from jaxcal.runtime.array_types import AnyArray, Float, HeldArray
 from jaxcal.runtime.arrays import array_module, array_tree, each_image, is_traced, static
 from jaxcal.runtime.jax_modes import importing_jax, in_own_modes
-from jaxcal.runtime.messages import shown
+from jaxcal.runtime.messages import counted, shown
 
 if TYPE_CHECKING:
     from jax.typing import DTypeLike
@@ -391,9 +391,8 @@ def check_values(problem: Problem) -> None:
         raise InputError("mask of the problem must hold 1 (used) or 0 (left out) for every image")
     used = mask > 0
     if used.sum() < MINIMUM_IMAGES:
-        raise InputError(
-            f"{int(used.sum())} used images are too few: at least {MINIMUM_IMAGES} are needed"
-        )
+        few = counted(int(used.sum()), "used image", "is", "are")
+        raise InputError(f"{few} too few: at least {MINIMUM_IMAGES} are needed")
     for name in ("poses", "measurements"):
         values = np.asarray(getattr(problem, name))
         bad = ~np.isfinite(values).reshape(len(used), -1).all(axis=1) & used

@@ -18,7 +18,7 @@ from jaxcal.data.probe import Probe, check_probe
 from jaxcal.runtime.array_types import Bool, Float, Int
 from jaxcal.runtime.arrays import is_traced
 from jaxcal.runtime.given_values import is_number, real_array
-from jaxcal.runtime.messages import shown
+from jaxcal.runtime.messages import counted, shown
 
 MINIMUM_IMAGES = 4
 """With fewer used images nothing can be solved: 3 residuals an image against 9 unknowns."""
@@ -287,9 +287,8 @@ def make_images(
         if not (is_number(minimum) and minimum >= 0):
             raise InputError(f"minimum must be a number of images, not {shown(minimum)}")
         if used.sum() < minimum:
-            raise InputError(
-                f"{int(used.sum())} used images are too few: at least {minimum} are needed"
-            )
+            few = counted(int(used.sum()), "used image", "is", "are")
+            raise InputError(f"{few} too few: at least {minimum} are needed")
         _check_magnitude("pose", poses, used)
         checked = check_poses(poses, used)
         values = used_values(kind, values, used)

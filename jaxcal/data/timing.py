@@ -14,11 +14,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
-from scipy.spatial.transform import Rotation, Slerp
 
 from jaxcal import InputError
 from jaxcal.data.poses import check_poses
+from jaxcal.runtime.array_types import Bool, Float
 from jaxcal.runtime.given_values import is_number, real_array
 from jaxcal.runtime.messages import seconds
 
@@ -106,6 +105,9 @@ def interpolate_poses(
         InputError: a time before the first pose or after the last, in a gap, or next to a pose
             that cannot be used; the time is named. :func:`can_interpolate` checks it beforehand.
     """
+    # It takes longer to import than all else that imports a table.
+    from scipy.spatial.transform import Rotation, Slerp
+
     times = _increasing(t, "time of pose")
     asked = _queries(query)
     if np.shape(poses)[:1] != times.shape:

@@ -60,7 +60,6 @@ class Columns:
     """Which columns of a row hold what; column numbers count from 0.
 
     Attributes:
-        width: number of columns.
         matrix: 12 or 16 columns of a pose, row by row; None without.
         translation: 3 columns beside a quaternion; None without.
         quaternion: 4 columns, x y z w; None without.
@@ -74,7 +73,6 @@ class Columns:
         time_s: one unit of time in s; None where the header does not say.
     """
 
-    width: int
     matrix: tuple[int, ...] | None = None
     translation: tuple[int, ...] | None = None
     quaternion: tuple[int, ...] | None = None
@@ -137,7 +135,6 @@ def columns_of_header(names: list[str], quaternion: QuaternionOrder | None) -> C
     if time_unit not in (None, *TIMES_S):
         raise FormatError(f"time in {quoted(str(time_unit))} is not known: s, ms, us or ns")
     return Columns(
-        width=len(names),
         matrix=matrix,
         translation=None if matrix is not None else translation,
         quaternion=quaternion_columns,

@@ -59,70 +59,71 @@ def read_pixel_size(path: str | os.PathLike[str]) -> PixelSize:
         FormatError: no DICOM file, damaged, no two-dimensional region in cm, or several with
             different pixel sizes; one line that starts with the path.
     """
-    name = os.fspath(path)
     check_readable(path)
-    data = _dataset(name)
-    with naming(name):
+    with naming(path):
+        data = _dataset(path)
         regions = _value(data, "SequenceOfUltrasoundRegions") or []
-    if len(regions) > _MOST_REGIONS:
-        raise FormatError(f"{name}: claims {len(regions)} ultrasound regions")
-    with naming(name):
+        if len(regions) > _MOST_REGIONS:
+            raise FormatError(f"claims {len(regions)} ultrasound regions")
         found = [
-            _region(name, region, data)
+            _region(region, data)
             for region in regions
             if _whole(region, "RegionSpatialFormat") == _TWO_DIMENSIONAL
         ]
-    if not found:
-        raise FormatError(
-            f"{name}: states no pixel size (no two-dimensional ultrasound region in cm): measure "
-            "it on the image's ruler and give it with --spacing"
-        )
-    if None in (found[0].columns, found[0].rows):
-        raise FormatError(f"{name}: is damaged or cut: it does not say how large its images are")
-    sizes = np.array([each.spacing_mm for each in found])
-    if (np.abs(sizes / sizes[0] - 1) > _AGREES).any():
-        told = "; ".join(f"{each.region}: {_text(each.spacing_mm)}" for each in found)
-        raise FormatError(
-            f"{name}: has regions with different pixel sizes ({told}): choose one with --spacing"
-        )
-    return found[0]
+        if not found:
+            raise FormatError(
+                "states no pixel size (no two-dimensional ultrasound region in cm): measure it on "
+                "the image's ruler and give it with --spacing"
+            )
+        if None in (found[0].columns, found[0].rows):
+            raise FormatError("is damaged or cut: it does not say how large its images are")
+        sizes = np.array([each.spacing_mm for each in found])
+        if (np.abs(sizes / sizes[0] - 1) > _AGREES).any():
+            told = "; ".join(
+                "{}: {:.6g} x {:.6g} mm".format(each.region, *each.spacing_mm) for each in found
+            )
+            raise FormatError(
+                f"has regions with different pixel sizes ({told}): choose one with --spacing"
+            )
+        return found[0]
 
 
-def _dataset(name: str) -> Dataset:
+def _dataset(path: str | os.PathLike[str]) -> Dataset:
     try:
         from pydicom import dcmread
     except ImportError:
+        name = os.fspath(path)
         raise MissingExtraError(f"{name}: needs pydicom: pip install 'jaxcal[dicom]'") from None
-    with open(name, "rb") as file:
+    with open(path, "rb") as file:
         # Whatever length the file claims, no more than this is read.
         content = BytesIO(file.read(_MOST_BYTES))
     try:
         # A file deflated as a whole would be unpacked without a bound; real clips are not deflated.
         if _DEFLATED.encode() in content.getvalue()[:4096]:
-            raise FormatError(f"{name}: is deflated as a whole, which is not read")
+            raise FormatError("is deflated as a whole, which is not read")
         return dcmread(content, stop_before_pixels=True)
     except FormatError:
         raise
     except Exception as error:
         # pydicom raises whatever it stumbles over.
-        raise FormatError(f"{name}: is not a DICOM file: {one_line(error)[:200]}") from None
+        raise FormatError(f"is not a DICOM file: {one_line(error)[:200]}") from None
 
 
-def _region(name: str, region: Dataset, data: Dataset) -> PixelSize:
+def _region(region: Dataset, data: Dataset) -> PixelSize:
     units = [_whole(region, f"PhysicalUnits{axis}Direction") for axis in "XY"]
     if units != [_CM, _CM]:
-        raise FormatError(f"{name}: a region's units are of codes {units}, not cm (3)")
+        raise FormatError(f"a region's units are of codes {units}, not cm (3)")
     spacing = []
     for axis in "XY":
-        step = abs(_number(name, region, f"PhysicalDelta{axis}")) * _MM_PER_CM
+        step = abs(_number(region, f"PhysicalDelta{axis}")) * _MM_PER_CM
         if not _PLAUSIBLE_MM[0] <= step <= _PLAUSIBLE_MM[1]:
-            raise FormatError(f"{name}: a pixel of {step:g} mm is not plausible")
+            raise FormatError(f"a pixel of {step:g} mm is not plausible")
         spacing.append(float(f"{step:.12g}"))
     edges = [
         _whole(region, f"RegionLocation{edge}") for edge in ("MinX0", "MinY0", "MaxX1", "MaxY1")
     ]
     if any(edge is None for edge in edges):
-        raise FormatError(f"{name}: a region has no location")
+        raise FormatError("a region has no location")
     left, top, right, bottom = (int(edge or 0) for edge in edges)
     return PixelSize(
         (spacing[0], spacing[1]),
@@ -130,10 +131,6 @@ def _region(name: str, region: Dataset, data: Dataset) -> PixelSize:
         _whole(data, "Rows"),
         (left, top, right - left + 1, bottom - top + 1),
     )
-
-
-def _text(spacing: tuple[float, float]) -> str:
-    return f"{spacing[0]:.6g} x {spacing[1]:.6g} mm"
 
 
 def _value(data: Dataset, keyword: str) -> Any:
@@ -148,8 +145,8 @@ def _whole(data: Dataset, keyword: str) -> int | None:
     return value if isinstance(value, int) else None
 
 
-def _number(name: str, data: Dataset, keyword: str) -> float:
+def _number(data: Dataset, keyword: str) -> float:
     value = _value(data, keyword)
     if not isinstance(value, int | float) or not np.isfinite(value):
-        raise FormatError(f"{name}: {keyword} is not a number: {quoted(str(value))}")
+        raise FormatError(f"{keyword} is not a number: {quoted(str(value))}")
     return float(value)

@@ -14,13 +14,10 @@ from jaxcal.io.given_files import naming
 from jaxcal.io.poses_by_time import times_of_table
 from jaxcal.io.sequence import TrackedSequence
 from jaxcal.io.slicer import pixels_from_markups, read_markups
+from jaxcal.io.sources import Assignment
 from jaxcal.io.text import PoseTable
 from jaxcal.runtime.array_types import Float, Int
-from jaxcal.runtime.messages import quoted, seconds
-
-Assignment = Literal["order", "labels"]
-"""How points without a time or a frame's number are assigned to frames: one for each frame in
-order, or by the frame's number at the end of each point's label."""
+from jaxcal.runtime.messages import counted, quoted, seconds
 
 _SLACK = 0.5
 """A point belongs to the frame nearest in time, within this part of the median interval."""
@@ -57,7 +54,8 @@ def points_of_markups(
     with naming(source):
         pixels = pixels_from_markups(markups)
         rows = _rows_of_markups(markups.labels, sequence, assignment)
-    notes = [f"{name}: {markups.unplaced} points were not placed"] if markups.unplaced else []
+    unplaced = counted(markups.unplaced, "point", "was", "were")
+    notes = [f"{name}: {unplaced} not placed"] if markups.unplaced else []
     return FramePoints(_distinct(rows, sequence, name), pixels, "pixel", notes)
 
 

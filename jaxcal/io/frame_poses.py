@@ -10,10 +10,9 @@ import numpy as np
 from jaxcal import InputError
 from jaxcal.io.folder import PROBE_TO_TRACKER, with_pose_table
 from jaxcal.io.frame_names import FramePair, capitalised
-from jaxcal.io.import_options import ImportOptions, refuse
-from jaxcal.io.poses_by_time import Tracking, times_of_table, with_poses_by_time
+from jaxcal.io.poses_by_time import times_of_table, with_poses_by_time
 from jaxcal.io.sequence import FolderPixels, TrackedSequence
-from jaxcal.io.sources import kind_of, read_rows, read_tracked
+from jaxcal.io.sources import ImportOptions, kind_of, read_rows, read_tracked, refuse
 from jaxcal.io.table import first_line
 from jaxcal.io.text import read_poses
 from jaxcal.runtime.array_types import Bool, Float
@@ -41,8 +40,8 @@ def open_sequence(
 
 def opened(
     source: str | os.PathLike[str], options: ImportOptions
-) -> tuple[TrackedSequence, Tracking | None, list[str]]:
-    """A sequence, and the poses that are to be matched to it by time, if there are such."""
+) -> tuple[TrackedSequence, TrackedSequence | None, list[str]]:
+    """A sequence, and another with the poses alone, if they are to be matched to it by time."""
     if options.poses is None:
         refuse(options, ("lag_s",), "needs --poses: a lag is between images and poses of two files")
         return read_tracked(source, options.pose_units), None, []
@@ -64,23 +63,21 @@ def opened(
         table = read_rows(options.poses, options)
         if table.poses is None or table.time is None:
             raise InputError(f"{table.name}: needs columns of times and of poses")
-        time, valid = times_of_table(table, sequence), np.ones(len(table), bool)
-        found = Tracking(
-            time,
-            table.poses,
-            valid,
-            PROBE_TO_TRACKER,
-            table.name,
-            table.length_stated,
-            table.time_stated,
+        found = TrackedSequence(
+            {PROBE_TO_TRACKER: table.poses},
+            {PROBE_TO_TRACKER: np.ones(len(table), bool)},
+            times_of_table(table, sequence),
+            np.zeros(len(table), bool),
+            source=table.name,
+            length_stated=table.length_stated,
+            time_stated=table.time_stated,
         )
         return sequence, found, table.notes
     tracking = read_tracked(options.poses, options.pose_units)
     start, end, said = _frames(tracking, options)
     poses, valid = tracking.poses(start, end)
-    pair, name = (start, end), os.fspath(options.poses)
-    found = Tracking(tracking.time, poses, valid, pair, name, tracking.length_stated)
-    return sequence, found, said
+    pair = start, end
+    return sequence, replace(tracking, transforms={pair: poses}, valid={pair: valid}), said
 
 
 def tracked_poses(

@@ -80,10 +80,6 @@ class CheckedFile(io.RawIOBase):
         self._place = origin + offset
         return self._place
 
-    def tell(self) -> int:
-        """As of any file."""
-        return self._place
-
     def readinto(self, buffer: Any) -> int:
         """Fill a buffer from the current place, after a look at the heaps that begin in it.
 

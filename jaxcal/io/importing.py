@@ -20,13 +20,13 @@ from jaxcal import InputError
 from jaxcal.data.recording import MetresError, Recording, make_images
 from jaxcal.io.frame_points import FramePoints, points_of_markups, points_of_table
 from jaxcal.io.frame_poses import opened, tracked_poses
-from jaxcal.io.import_options import ImportOptions, refuse
-from jaxcal.io.poses_by_time import Tracking, lag_of_points, with_poses_by_time
+from jaxcal.io.poses_by_time import lag_of_points, with_poses_by_time
 from jaxcal.io.sequence import Pixels, TrackedSequence
-from jaxcal.io.sources import SEQUENCES, kind_of, read_rows
+from jaxcal.io.sources import SEQUENCES, ImportOptions, kind_of, read_rows, refuse
 from jaxcal.io.target_search import FrameResults, search_target
 from jaxcal.io.text import read_crosswire, recording_of
 from jaxcal.runtime.array_types import Bool, Float, Int
+from jaxcal.runtime.messages import counted
 
 
 class Imported(NamedTuple):
@@ -192,7 +192,7 @@ def _from_sequence(
 def _estimated_lag(
     sequence: TrackedSequence,
     placed: FramePoints | None,
-    tracking: Tracking,
+    tracking: TrackedSequence,
     options: ImportOptions,
 ) -> tuple[float, str, FrameResults | None]:
     """The lag and a note, and the target in all frames if it had to be looked for."""
@@ -228,7 +228,7 @@ def _usable_points(
     rows = placed.rows[order]
     tracked, shown = valid[rows], _shown(sequence, rows)
     notes = [
-        f"{int(lost.sum())} points left out: their frame's {what} was not OK"
+        f"{counted(int(lost.sum()), 'point')} left out, in frames whose {what} was not OK"
         for lost, what in ((~tracked, "tracking"), (tracked & ~shown, "image"))
         if lost.any()
     ]
@@ -311,11 +311,12 @@ def _found_points(sequence: TrackedSequence, results: FrameResults, minimum: int
             f"target, at least {minimum} are needed (most often: {most}); place the points "
             "by hand: jaxcal pick"
         )
-    notes = [f"{blank} frames left out: their image was not OK"] if blank else []
+    notes = []
+    if blank:
+        notes.append(f"{blank} of {len(results)} frames left out: their image was not OK")
     if hidden:
-        most = next(iter(results.reasons))
+        why = "; ".join(f"{reason}: {count}" for reason, count in results.reasons.items())
         notes.append(
-            f"{hidden} of {len(used) + hidden} frames left out: no credible target in them (most "
-            f"often: {most})"
+            f"{hidden} of {len(results)} frames left out: no credible target in them ({why})"
         )
     return FramePoints(used, results.position[used], "pixel", notes, results.covariance[used])

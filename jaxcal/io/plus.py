@@ -10,7 +10,6 @@ Source: PlusLib, vtkPlusConfig and IGSIO's vtkIGSIOTransformRepository.
 from __future__ import annotations
 
 import datetime
-import math
 import os
 from typing import NamedTuple
 from xml.sax.saxutils import quoteattr
@@ -22,6 +21,7 @@ from jaxcal.data.poses import check_affine
 from jaxcal.io.atomic import write_bytes
 from jaxcal.io.frame_names import FramePair, capitalised, check_frames, path_between, split_name
 from jaxcal.io.given_files import naming
+from jaxcal.io.table import finite_numbers
 from jaxcal.io.xml import Element, parse_xml, read_xml
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.messages import quoted
@@ -72,7 +72,8 @@ def read_transform(
             elements = [each for place in root.all(_COORDINATES) for each in _transforms(place)]
         # All are looked at: a file with a damaged transform is not to be trusted.
         stated = [(_matrix(e), _frames(e), _optional_number(e, "Error"), e) for e in elements]
-        ends = {to for _, (start, to), *_ in stated if start == wanted[0] and not _inner(to)}
+        ends = {to for _, (start, to), *_ in stated if start == wanted[0]}
+        ends = {to for to in ends if not to.startswith("TransducerOrigin")}
         if target is None and len(ends) == 1:
             wanted = wanted[0], *ends
         for matrix, frames, error_mm, element in stated:
@@ -83,11 +84,6 @@ def read_transform(
                     error_mm = _optional_number(errors, "CalibrationMeanMm")
                 return PlusTransform(matrix, error_mm, frames[1])
         raise FormatError(f"holds no transform from {' to '.join(wanted)}")
-
-
-def _inner(frame: str) -> bool:
-    """Whether a frame is one of the transducer's, in the image (TransducerOriginPixel)."""
-    return frame.startswith("TransducerOrigin")
 
 
 def _check_root(root: Element) -> None:
@@ -130,21 +126,8 @@ def _attribute(element: Element, name: str) -> str:
 
 
 def _numbers(element: Element, name: str, count: int) -> Float[np.ndarray, " count"]:
-    text = _attribute(element, name)
-    try:
-        numbers = [float(part) for part in text.split()]
-    except ValueError:
-        raise FormatError(
-            f"line {element.line}: {name} of <{element.tag}> is not numbers: {quoted(text)}"
-        ) from None
-    if len(numbers) != count:
-        raise FormatError(
-            f"line {element.line}: {name} of <{element.tag}> has {len(numbers)} numbers, {count} "
-            "are needed"
-        )
-    if not all(map(math.isfinite, numbers)):
-        raise FormatError(f"line {element.line}: {name} of <{element.tag}> holds NaN or Inf")
-    return np.array(numbers)
+    what = f"line {element.line}: {name} of <{element.tag}>"
+    return finite_numbers(_attribute(element, name), count, what)
 
 
 def _optional_number(element: Element | None, name: str) -> float | None:

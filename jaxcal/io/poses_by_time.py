@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -15,10 +14,9 @@ from jaxcal.data.timing import (
     interpolate_poses,
     motion_along_main_axis,
 )
-from jaxcal.io.frame_names import FramePair
 from jaxcal.io.sequence import TrackedSequence
 from jaxcal.io.text import PoseTable
-from jaxcal.runtime.array_types import Bool, Float, Int
+from jaxcal.runtime.array_types import Float, Int
 from jaxcal.runtime.messages import seconds
 
 LONGEST_GAP = 5.0
@@ -27,28 +25,6 @@ _SHORT = 0.02
 """Images of less than this part of the tracking make one ask for the unit of its times."""
 _ROUNDED_S = 1e-6
 """Times that were written as text and read again may be off by so much."""
-
-
-class Tracking(NamedTuple):
-    """Poses that are to be matched to images by time.
-
-    Attributes:
-        time: (m,) s.
-        poses: (m, 4, 4), mm.
-        valid: (m,) which of them can be used.
-        pair: frames (from, to) of the poses.
-        source: the file, for messages.
-        length_stated: whether the file states the unit of translations.
-        time_stated: whether the unit of its times is known, and not only taken for seconds.
-    """
-
-    time: Float[np.ndarray, " m"]
-    poses: Float[np.ndarray, "m 4 4"]
-    valid: Bool[np.ndarray, " m"]
-    pair: FramePair
-    source: str
-    length_stated: bool = False
-    time_stated: bool = True
 
 
 def times_of_table(table: PoseTable, sequence: TrackedSequence) -> Float[np.ndarray, " m"]:
@@ -75,11 +51,12 @@ def times_of_table(table: PoseTable, sequence: TrackedSequence) -> Float[np.ndar
 
 
 def with_poses_by_time(
-    images: TrackedSequence, tracking: Tracking, lag_s: float = 0.0
+    images: TrackedSequence, tracking: TrackedSequence, lag_s: float = 0.0
 ) -> tuple[TrackedSequence, list[str]]:
-    """A sequence's frames with poses interpolated at their times, on the same clock.
+    """Frames of one sequence with poses of another, interpolated at their times on one clock.
 
-    An image stamped t shows what was at t - ``lag_s``. The sequence's own transforms are dropped.
+    An image stamped t shows what was at t - ``lag_s``. The sequence's own transforms are dropped,
+    and those of ``tracking`` are only the poses.
 
     Returns:
         The sequence, valid where a pose could be interpolated; and notes for the user.
@@ -88,15 +65,16 @@ def with_poses_by_time(
         InputError: images or poses without times, times that go back, no image between poses, or
             times of poses that are taken for seconds, though hardly any could be of the images.
     """
-    time, poses, valid, pair, source, length_stated, time_stated = tracking
+    source = tracking.source
+    ((pair, poses),) = tracking.transforms.items()
     if not np.isfinite(images.time).all():
         raise InputError(
             f"{images.source}: has no times, so its poses cannot be looked up in {source}"
         )
-    kept = _increasing(time, source)
-    time, poses, valid = time[kept], poses[kept], valid[kept]
+    kept = _increasing(tracking.time, source)
+    time, poses, valid = tracking.time[kept], poses[kept], tracking.valid[pair][kept]
     interval = float(np.median(np.diff(time)))
-    if not time_stated:
+    if not tracking.time_stated:
         _check_unit(images, time, interval, source)
     gap = LONGEST_GAP * interval
     asked = _within(images.time - lag_s, time[valid])
@@ -120,7 +98,7 @@ def with_poses_by_time(
         images,
         transforms={pair: found},
         valid={pair: between},
-        length_stated=length_stated,
+        length_stated=tracking.length_stated,
         without_status=(),
     ), notes
 
@@ -172,7 +150,7 @@ def lag_of_points(
     images: TrackedSequence,
     rows: Int[np.ndarray, " n"],
     points: Float[np.ndarray, "n 2"],
-    tracking: Tracking,
+    tracking: TrackedSequence,
 ) -> tuple[float, str]:
     """By how much images lag behind poses, from the motion of a target at rest in the images.
 
@@ -185,9 +163,9 @@ def lag_of_points(
         InputError: times missing, too little motion, or motions that do not agree; see
             :func:`jaxcal.data.timing.estimate_latency`.
     """
-    time, poses, valid, *_ = tracking
-    kept = _increasing(time, tracking.source)
-    kept = kept[valid[kept]]
+    ((pair, poses),) = tracking.transforms.items()
+    kept = _increasing(tracking.time, tracking.source)
+    kept = kept[tracking.valid[pair][kept]]
     order = np.argsort(rows)
     try:
         if not len(kept) or not len(rows):
@@ -195,7 +173,7 @@ def lag_of_points(
         found = estimate_latency(
             images.time[rows[order]],
             along_main_axis(points[order]),
-            time[kept],
+            tracking.time[kept],
             motion_along_main_axis(poses[kept]),
         )
     except InputError as error:

@@ -15,7 +15,7 @@ import re
 import numpy as np
 
 from jaxcal import FormatError, InputError
-from jaxcal.data.poses import check_poses, quaternion_from_rotation, rotations_from_quaternions
+from jaxcal.data.poses import check_poses, quaternions_from_rotations, rotations_from_quaternions
 from jaxcal.io.lines import text_lines
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.messages import quoted
@@ -27,7 +27,7 @@ _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_/]*")
 def _seven(matrix: Float[np.ndarray, "4 4"]) -> dict[str, str]:
     """x, y, z in metres and the quaternion, with every digit."""
     pose = check_poses(np.asarray(matrix, float)[None], what="transform")[0]
-    numbers = [*(pose[:3, 3] / 1e3), *quaternion_from_rotation(pose[:3, :3])]
+    numbers = [*(pose[:3, 3] / 1e3), *quaternions_from_rotations(pose[None, :3, :3])[0]]
     return {key: _digits(float(value)) for key, value in zip(_KEYS, numbers, strict=True)}
 
 

@@ -108,6 +108,7 @@ class TrackedSequence:
             count from 0.
         clock: the date from which times count; None: they are seconds of a device's own clock.
         length_stated: whether the file of the transforms states their unit of length.
+        time_stated: whether the unit of times is known, and not only taken for seconds.
         without_status: transforms that lack a status in some frame, where they are taken as OK.
     """
 
@@ -120,6 +121,7 @@ class TrackedSequence:
     numbers: Int[np.ndarray, " n"] | None = None
     clock: datetime | None = None
     length_stated: bool = False
+    time_stated: bool = True
     without_status: tuple[FramePair, ...] = ()
 
     def __len__(self) -> int:

@@ -9,7 +9,6 @@ Format: IGSIO, vtkIGSIOMetaImageSequenceIO and vtkIGSIONrrdSequenceIO.
 
 from __future__ import annotations
 
-import math
 import re
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
@@ -24,7 +23,7 @@ from jaxcal.io.frame_names import FramePair, check_frames, split_name
 from jaxcal.io.given_files import one_line
 from jaxcal.io.pixel_stream import Packing, PixelStream
 from jaxcal.io.sequence import Orientation, Pixels, TrackedSequence
-from jaxcal.runtime.array_types import Float
+from jaxcal.io.table import finite_numbers
 from jaxcal.runtime.messages import quoted
 
 MAXIMUM_HEADER = 64 * 2**20
@@ -156,7 +155,8 @@ def sequence_of(
     image_valid = np.full(count, pixels is not None)
     for number, fields in header.frames.items():
         if "Timestamp" in fields:
-            time[number] = _stamp(*fields["Timestamp"])
+            value, line = fields["Timestamp"]
+            time[number] = finite_numbers(value, 1, f"line {line}: the time stamp")[0]
         if image_status in fields and fields[image_status][0].upper() != "OK":
             image_valid[number] = False
         for field_name, (value, line) in fields.items():
@@ -170,7 +170,8 @@ def sequence_of(
             if status is None:
                 without_status[pair] = None
             if status is None or status[0].upper() == "OK":
-                transforms[pair][number] = _sixteen(value, line)
+                what = f"line {line}: a transform with status OK"
+                transforms[pair][number] = finite_numbers(value, 16, what).reshape(4, 4)
                 valid[pair][number] = True
     return TrackedSequence(
         transforms,
@@ -181,30 +182,6 @@ def sequence_of(
         name,
         without_status=tuple(without_status),
     )
-
-
-def _stamp(value: str, line: int) -> float:
-    try:
-        found = float(value)
-    except ValueError:
-        raise FormatError(f"line {line}: {quoted(value)} is not a time stamp") from None
-    if not math.isfinite(found):
-        raise FormatError(f"line {line}: the time stamp is {quoted(value)}")
-    return found
-
-
-def _sixteen(value: str, line: int) -> Float[np.ndarray, "4 4"]:
-    parts = value.split()
-    try:
-        numbers = [float(part) for part in parts]
-    except ValueError:
-        raise FormatError(f"line {line}: {quoted(value)} are not numbers") from None
-    if len(numbers) != 16:
-        raise FormatError(f"line {line}: a transform has 16 numbers, not {len(numbers)}")
-    matrix = np.array(numbers).reshape(4, 4)
-    if not np.isfinite(matrix).all():
-        raise FormatError(f"line {line}: a transform with status OK holds NaN or Inf")
-    return matrix
 
 
 def check_written(transforms: Mapping[FramePair, np.ndarray], time: np.ndarray) -> None:

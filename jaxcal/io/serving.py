@@ -45,7 +45,9 @@ class TransformServer:
         self, name: str, matrix: Float[np.ndarray, "4 4"], host: str = "127.0.0.1", port: int = PORT
     ) -> None:
         if not 0 < len(name.encode(errors="replace")) <= _LONGEST_NAME or not name.isprintable():
-            raise InputError(f"{name!r}: a device's name has 1 to {_LONGEST_NAME} bytes of text")
+            raise InputError(
+                f"{name!r}: a device's name has 1 to {_LONGEST_NAME} bytes of text (--name)"
+            )
         if not np.isfinite(matrix).all():
             raise InputError("the matrix holds NaN or Inf")
         if not host:

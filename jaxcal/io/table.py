@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 import os
 import re
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -92,6 +94,25 @@ def parse_numbers(texts: list[str], *, decimal_comma: bool = False) -> list[floa
     return found
 
 
+def finite_numbers(
+    text: str, count: int, what: str, separator: str | None = None
+) -> Float[np.ndarray, " count"]:
+    """Numbers with blanks between them, or another separator.
+
+    Raises:
+        FormatError: others than ``count`` finite numbers; the message begins with ``what``.
+    """
+    try:
+        numbers = np.array([float(part) for part in text.split(separator)])
+    except ValueError:
+        raise FormatError(f"{what} is not numbers: {quoted(text)}") from None
+    if len(numbers) != count:
+        raise FormatError(f"{what} must have {count} numbers, not {len(numbers)}")
+    if not np.isfinite(numbers).all():
+        raise FormatError(f"{what} holds NaN or Inf: {quoted(text)}")
+    return numbers
+
+
 def read_table(
     path: str | os.PathLike[str], *, header: bool = True, separator: str | None = None
 ) -> Table:
@@ -140,6 +161,13 @@ def read_table(
     if not rows:
         raise FormatError(f"{name}: holds no rows of numbers")
     return Table(name, names, rows, lines, separator or "")
+
+
+def csv_text(rows: Iterable[Sequence[object]]) -> str:
+    """A table with commas between its cells, for other programs."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue()
 
 
 def first_line(path: str | os.PathLike[str]) -> tuple[str, bool]:

@@ -68,6 +68,11 @@ class FrameResults:
         return {name: int((self.fate == number).sum()) for number, name in enumerate(FATES)}
 
     @property
+    def most_lost(self) -> bool:
+        """Whether more frames were left out, for whatever reason, than the target was found in."""
+        return len(self.found) < len(self) / 2
+
+    @property
     def reasons(self) -> dict[str, int]:
         """Number of frames by the reason for which no target was credible, the commonest first."""
         short = (
@@ -86,7 +91,7 @@ def search_target(
 ) -> FrameResults:
     """Look for the target in every frame that was tracked.
 
-    The options are those of :class:`jaxcal.io.import_options.ImportOptions`.
+    The options are those of :class:`jaxcal.io.sources.ImportOptions`.
 
     Raises:
         FormatError: pixels that cannot be read.

@@ -20,7 +20,7 @@ from jaxcal.io.columns import LENGTHS_MM, Columns, LengthUnit, columns_of_header
 from jaxcal.io.given_files import naming
 from jaxcal.io.table import Table, first_line, has_commented_header, parse_numbers, read_table
 from jaxcal.runtime.array_types import Float, Int
-from jaxcal.runtime.messages import quoted
+from jaxcal.runtime.messages import counted, quoted
 
 _LATEST_S = 1e11
 """Latest time, s after any beginning: three thousand years. Stamps in ms or ns are beyond it."""
@@ -85,7 +85,8 @@ class PoseTable:
     @property
     def notes(self) -> list[str]:
         """What was left out, in words."""
-        return [f"{self.name}: {self.skipped} invalid rows left out"] if self.skipped else []
+        rows = counted(self.skipped, "invalid row")
+        return [f"{self.name}: {rows} left out"] if self.skipped else []
 
 
 def read_pose_table(
@@ -294,7 +295,7 @@ def _columns(table: Table, quaternion: QuaternionOrder | None) -> Columns:
     width = len(table.rows[0])
     if width in (15, 19):
         matrix = tuple(range(1, width - 2))
-        return Columns(width, matrix=matrix, time=0, point=(width - 2, width - 1))
+        return Columns(matrix=matrix, time=0, point=(width - 2, width - 1))
     if width != 10:
         hint = ", or a first line that names the columns"
         if width == 2:
@@ -311,7 +312,7 @@ def _columns(table: Table, quaternion: QuaternionOrder | None) -> Columns:
             "first or last (--quaternion wxyz or xyzw)"
         )
     order = (5, 6, 7, 4) if quaternion == "wxyz" else (4, 5, 6, 7)
-    return Columns(10, translation=(1, 2, 3), quaternion=order, time=0, point=(8, 9))
+    return Columns(translation=(1, 2, 3), quaternion=order, time=0, point=(8, 9))
 
 
 def _used_rows(table: Table, columns: Columns, skip_invalid: bool) -> tuple[list[int], int]:

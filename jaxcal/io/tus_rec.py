@@ -18,9 +18,9 @@ from jaxcal.io.given_files import check_readable, naming
 from jaxcal.io.lines import text_lines
 from jaxcal.io.sequence import Hdf5Pixels, TrackedSequence
 from jaxcal.io.sequence_header import LARGEST_FRAME, MOST_FRAMES
+from jaxcal.io.table import finite_numbers
 from jaxcal.io.untrusted import UpTo, array, check_rows, child, open_root
 from jaxcal.runtime.array_types import Float
-from jaxcal.runtime.messages import quoted
 
 FRAMES = "Tool", "Tracker"
 
@@ -112,15 +112,7 @@ def read_calib_matrix(
 
 
 def _four_rows(lines: list[tuple[int, str]]) -> Float[np.ndarray, "4 4"]:
-    rows = []
-    for line, content in lines:
-        try:
-            row = [float(cell) for cell in content.split(",")]
-        except ValueError:
-            raise FormatError(f"line {line}: not numbers: {quoted(content)}") from None
-        if len(row) != 4 or not np.isfinite(row).all():
-            raise FormatError(f"line {line}: four finite numbers are needed")
-        rows.append(row)
-    if np.abs(np.array(rows[3]) - [0, 0, 0, 1]).max() > 1e-9:
+    rows = np.array([finite_numbers(row, 4, f"line {line}: a row", ",") for line, row in lines])
+    if np.abs(rows[3] - [0, 0, 0, 1]).max() > 1e-9:
         raise InputError(f"line {lines[3][0]}: the last row of a matrix is 0 0 0 1")
-    return np.array(rows)
+    return rows

@@ -30,7 +30,7 @@ from jaxcal.report.certified import certificate_words
 from jaxcal.report.next_poses import next_poses_sentences
 from jaxcal.report.paragraphs import BULLET, listed
 from jaxcal.report.resampled import resampled_sentences
-from jaxcal.report.tables import frames_and_target
+from jaxcal.report.tables import frames_and_target, further_facts
 from jaxcal.report.verdict import (
     advice,
     believe,
@@ -48,6 +48,7 @@ from jaxcal.result.calibration import Calibration
 from jaxcal.result.saved import transform_from_record
 from jaxcal.result.transform import SaveFormat
 from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.messages import counted
 
 MOST_POSES, MOST_PLANES = 300, 60
 """Most poses, and most image planes, that are drawn in space."""
@@ -251,21 +252,20 @@ def _findings(record: dict[str, Any]) -> str:
     return _section("What to look at, and what to do", *parts) if parts else ""
 
 
-def _accuracy(record: dict[str, Any], answer: Calibration, recording: Recording) -> str:
+def map_of_error(record: dict[str, Any], answer: Calibration, recording: Recording) -> str:
+    """The error to expect over the image, and where the target was seen, as SVG."""
     tre = record["tre"]
-    mapped = {name: np.array(tre["map"][name], float) for name in ("lateral_mm", "axial_mm")}
-    error = tre["factor"] * np.array(tre["map"]["stated_mm"], float)
-    used = np.asarray(answer.mask) > 0
-    poses = recording.calibration.poses[used]
-    seen = targets_in_images(poses, answer.image_to_probe, answer.point)[:, [0, 2]]
-    drawn = svg.error_map(
-        mapped["lateral_mm"],
-        mapped["axial_mm"],
-        error,
-        seen,
-        "Target registration error to expect over the image, mm",
+    lateral, axial, stated = (
+        np.array(tre["map"][name], float) for name in ("lateral_mm", "axial_mm", "stated_mm")
     )
-    rows = []
+    poses = recording.calibration.poses[np.asarray(answer.mask) > 0]
+    seen = targets_in_images(poses, answer.image_to_probe, answer.point)[:, [0, 2]]
+    label = "Target registration error to expect over the image, mm"
+    return svg.error_map(lateral, axial, tre["factor"] * stated, seen, label)
+
+
+def _accuracy(record: dict[str, Any], answer: Calibration, recording: Recording) -> str:
+    tre, rows = record["tre"], []
     for k, point in enumerate(tre["points"]):
         path = f"tre.points.{k}"
         u, v = (_number(record, f"{path}.image.{axis}", "z.1f") for axis in range(2))
@@ -283,7 +283,7 @@ def _accuracy(record: dict[str, Any], answer: Calibration, recording: Recording)
     return _section(
         "How accurate",
         '<div class="grid"><figure>',
-        drawn,
+        map_of_error(record, answer, recording),
         "<figcaption>Distance to expect between the true position of what is seen at a point of "
         "the image and its position by this calibration. Dots: where the target was."
         "</figcaption></figure><div>",
@@ -593,27 +593,17 @@ def _in_unit(name: str, sd: float) -> str:
 
 def _facts(record: dict[str, Any]) -> str:
     rows = [
-        ("status", f"{record['status']} after {record['iterations']} iterations"),
+        ("status", f"{record['status']} after {counted(record['iterations'], 'iteration')}"),
         ("images", f"{record['images_used']} used of {record['images']}"),
         ("data", record["data"]),
         ("jaxcal", record["jaxcal_version"]),
         *([("date (UTC)", record["date"])] if "date" in record else []),
         *frames_and_target(record),
+        *further_facts(record),
     ]
-    scale = record["scale_mm_per_px"]
-    if scale is not None:
-        rows.append(("pixel size (mm)", f"{scale[0]:.6f} lateral, {scale[1]:.6f} axial"))
-    for name, key, unit, form in (
-        ("sound speed (m/s)", "sound_speed{}_m_s", 1.0, ".1f"),
-        ("delay (us)", "delay{}_s", 1e6, ".3f"),
-    ):
-        value, sd = record[key.format("")], record[key.format("_sd")]
-        if value is not None:
-            spread = "-" if sd is None else format(unit * sd, form)
-            rows.append((name, f"{unit * value:{form}} ± {spread}"))
     return _section(
         "Facts",
-        _table([(escape(name), escape(str(value))) for name, value in rows], words=2),
+        _table([(escape(name), escape(value.replace("+-", "±"))) for name, value in rows], words=2),
         '<p class="soft">The whole record of the calibration is inside this page '
         "(the element with the id record).</p>",
     )

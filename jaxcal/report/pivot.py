@@ -8,6 +8,7 @@ import numpy as np
 
 from jaxcal.diagnostics.outliers import outlier_reasons, outliers
 from jaxcal.report.record import plain
+from jaxcal.runtime.messages import counted
 
 if TYPE_CHECKING:
     from jaxcal.calibration.pivot import Pivot
@@ -57,5 +58,6 @@ def pivot_lines(record: dict[str, Any]) -> list[str]:
         spread = [record["covariance"][axis][axis] ** 0.5 for axis in range(3)]
         lines.append("SD of the tip (mm): " + ", ".join(f"{value:.3f}" for value in spread))
     if record["repeated"]:
-        lines.append(f"{record['repeated']} poses repeat an earlier one exactly and are not used")
+        again = counted(record["repeated"], "pose", "repeats", "repeat")
+        lines.append(f"{again} an earlier one exactly: not used")
     return [*lines, *(f"- {text}" for text in record["warnings"] if text != wrong)]

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from jaxcal import CalibrationError
-from jaxcal.data.poses import targets_in_images
 from jaxcal.data.recording import Images, Recording
 from jaxcal.report.record import calibration_record
 from jaxcal.result.calibration import Calibration
@@ -96,24 +95,14 @@ def batch_text(calibration: Calibration) -> str:
 
 def html_of(calibration: Calibration) -> str:
     """Verdict, error map and numbers for a notebook, without script and with their own styles."""
-    from jaxcal.report import svg
+    from jaxcal.report.page import map_of_error
     from jaxcal.report.verdict import title_of_transform, verdict
 
     record = record_of(calibration)
     lines = verdict(record)
     drawn, tre = "", record["tre"]
     if tre is not None and tre.get("factor") is not None:
-        answer, mapped = calibration.numpy(), tre["map"]
-        images = recording_of(calibration).calibration
-        used = images.poses[np.asarray(answer.mask) > 0]
-        seen = targets_in_images(used, answer.image_to_probe, answer.point)[:, [0, 2]]
-        drawn = svg.error_map(
-            np.array(mapped["lateral_mm"]),
-            np.array(mapped["axial_mm"]),
-            tre["factor"] * np.array(mapped["stated_mm"]),
-            seen,
-            "Target registration error to expect over the image, mm",
-        )
+        drawn = map_of_error(record, calibration.numpy(), recording_of(calibration))
     matrix = "".join(
         "<tr>" + "".join(f"<td style='text-align:right'>{_cell(v)}</td>" for v in row) + "</tr>"
         for row in record["image_plane_to_probe"]

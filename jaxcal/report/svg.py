@@ -47,14 +47,18 @@ def viridis(share: Number) -> str:
 
 
 def ticks(low: Number, high: Number, most: int = 6) -> list[Any]:
-    """Round numbers between two others, at most ``most`` of them."""
+    """Round numbers between two others, at most ``most`` of them, or two more to have a second.
+
+    A single number would tell no scale.
+    """
     if not high > low:
         return [low]
     rough = (high - low) / max(most - 1, 1)
     power = 10.0 ** math.floor(math.log10(rough))
     step = next(power * k for k in (1, 2, 5, 10) if power * k >= rough * (1 - 1e-9))
     first = math.ceil(low / step - 1e-9)
-    return [k * step for k in range(first, math.floor(high / step + 1e-9) + 1)]
+    found = [k * step for k in range(first, math.floor(high / step + 1e-9) + 1)]
+    return found if len(found) > 1 or most > 9 else ticks(low, high, most + 2)
 
 
 def bar_length(size: float) -> float:
@@ -166,10 +170,7 @@ class Panel:
             if x_label:
                 parts.append(text(across, bottom + 12, number(value), kind="tick"))
         most_down = max(int((bottom - top) / 19), 3)
-        down_ticks = ticks(*self.y, most_down)
-        if len(down_ticks) < 2:  # a single number tells no scale
-            down_ticks = ticks(*self.y, most_down + 2)
-        for value in down_ticks:
+        for value in ticks(*self.y, most_down):
             down = self.place(self.x[0], value)[1]
             parts.append(line(left, down, right, down, "var(--grid)", 0.6))
             parts.append(text(left - 5, down + 3.2, number(value), "end", "tick"))
@@ -317,11 +318,7 @@ def _colour_bar(left: Number, top: Number, height: Number, low: Number, high: Nu
         y = top + height * (1 - (k + 1) / steps)
         colour = viridis((k + 0.5) / steps)
         parts.append(rect(left, y, 12, height / steps + 0.4, f'fill="{colour}"'))
-    most = 5 if height >= 90 else 3
-    found = ticks(low, high, most)
-    if len(found) < 2:  # a single number tells no scale
-        found = ticks(low, high, most + 2)
-    for value in found:
+    for value in ticks(low, high, 5 if height >= 90 else 3):
         y = top + height * (1 - (value - low) / ((high - low) or 1.0))
         parts.append(line(left + 12, y, left + 15, y, "var(--text)", 0.8))
         parts.append(text(left + 18, y + 3.2, number(value), "start", "tick"))

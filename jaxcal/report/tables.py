@@ -11,6 +11,7 @@ from rich.table import Table
 
 from jaxcal.report.certified import certificate_words
 from jaxcal.report.verdict import spread_of_transform, title_of_transform
+from jaxcal.runtime.messages import counted
 
 _UNKNOWN = "-"
 _IN_OWN_UNITS = ("scale", "sound-speed", "delay")
@@ -69,7 +70,7 @@ def _facts(record: dict[str, Any]) -> list[tuple[str, str]]:
     facts = [
         *_accuracy(record),
         ("method", f"{record['method']}{prior}"),
-        ("status", f"{record['status']} after {record['iterations']} iterations"),
+        ("status", f"{record['status']} after {counted(record['iterations'], 'iteration')}"),
         ("images", f"{record['images_used']} used of {record['images']}"),
         *frames_and_target(record),
         (
@@ -90,33 +91,7 @@ def _facts(record: dict[str, Any]) -> list[tuple[str, str]]:
     spread = spread_of_transform(record)
     if spread is not None:
         facts.append(("SD of image_plane_to_probe", f"{spread[0]:.3f} mm, {spread[1]:.3f} deg"))
-    if record["scale_mm_per_px"] is not None:
-        facts.append(("pixel scale (mm/px)", _numbers(record["scale_mm_per_px"], ".6f")))
-    if record["sound_speed_m_s"] is not None:
-        facts.append(
-            (
-                "sound speed (m/s)",
-                f"{_number(record['sound_speed_m_s'], '.1f')} +- "
-                f"{_number(record['sound_speed_sd_m_s'], '.1f')}",
-            )
-        )
-    if record["delay_s"] is not None:
-        sd = record["delay_sd_s"]
-        facts.append(
-            (
-                "delay (us)",
-                f"{1e6 * record['delay_s']:.3f} +- " + ("-" if sd is None else f"{1e6 * sd:.3f}"),
-            )
-        )
-    for name, found in record["further_unknowns"].items():
-        if name not in _IN_OWN_UNITS:
-            words = [
-                f"{tangent} {_number(value, '.5g')} +- {_number(sd, '.2g')}"
-                for tangent, value, sd in zip(
-                    found["tangents"], found["values"], found["sd"], strict=True
-                )
-            ]
-            facts.append((name, ", ".join(words)))
+    facts += further_facts(record)
     sight = record["observability"]
     # If the direction is not determined at all, the SD only shows where rounding begins.
     sd = sight["weakest_sd_mm"] if record["status"] != "unobservable" else None
@@ -136,6 +111,31 @@ def _facts(record: dict[str, Any]) -> list[tuple[str, str]]:
                 f"target {_number(error['point_mm'], '.3f')} mm",
             )
         )
+    return facts
+
+
+def further_facts(record: dict[str, Any]) -> list[tuple[str, str]]:
+    """The unknowns that were estimated beside the transform and the target, with their SDs."""
+    facts = []
+    if record["scale_mm_per_px"] is not None:
+        facts.append(("pixel scale (mm/px)", _numbers(record["scale_mm_per_px"], ".6f")))
+    for name, key, unit, factor, form in (
+        ("sound speed (m/s)", "sound_speed", "_m_s", 1.0, ".1f"),
+        ("delay (us)", "delay", "_s", 1e6, ".3f"),
+    ):
+        value, sd = record[f"{key}{unit}"], record[f"{key}_sd{unit}"]
+        if value is not None:
+            spread = _number(None if sd is None else factor * sd, form)
+            facts.append((name, f"{factor * value:{form}} +- {spread}"))
+    for name, found in record["further_unknowns"].items():
+        if name not in _IN_OWN_UNITS:
+            words = [
+                f"{tangent} {_number(value, '.5g')} +- {_number(sd, '.2g')}"
+                for tangent, value, sd in zip(
+                    found["tangents"], found["values"], found["sd"], strict=True
+                )
+            ]
+            facts.append((name, ", ".join(words)))
     return facts
 
 

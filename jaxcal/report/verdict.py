@@ -27,6 +27,10 @@ _MORE_VARIED = (
     "Add images with the probe tilted by 20 to 30 degrees about each of its three axes, and with "
     "the target in all parts of the image, near and far, left and right."
 )
+_BEYOND = (
+    "Beyond these, vary all tilts and where the target is in the image: near and far, left and "
+    "right."
+)
 _KINDS = {
     "lateral": "lateral errors of the points",
     "range": "range errors of the points",
@@ -315,7 +319,7 @@ def _addition(record: dict[str, Any]) -> str:
     first = record["observability"].get("advice")
     if not first:
         return _MORE_VARIED
-    return f"{first[0].upper()}{first[1:]}. {_MORE_VARIED}"
+    return f"{first[0].upper()}{first[1:]}. {_BEYOND}"
 
 
 def _out_of_plane(record: dict[str, Any]) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 import json
 import math
@@ -18,6 +17,7 @@ from jaxcal import FormatError, InputError
 from jaxcal.data.recording import Recording
 from jaxcal.io.atomic import STAGED, made_folder, replace_files, write_text
 from jaxcal.io.given_files import path_name
+from jaxcal.io.table import csv_text
 from jaxcal.report.convergence import Curve
 from jaxcal.report.verdict import verdict
 from jaxcal.result.calibration import Calibration
@@ -163,28 +163,24 @@ def write_json(path: str | os.PathLike[str], record: dict[str, Any]) -> None:
 
 def _residual_table(result: Calibration, frame: Int[np.ndarray, " n"] | None) -> str:
     answer = result.numpy()
-    table = io.StringIO()
-    rows = csv.writer(table, lineterminator="\n")
-    rows.writerow(COLUMNS)
+    rows: list[tuple[object, ...]] = [COLUMNS]
     for image in range(len(answer.mask)):
         used = bool(answer.mask[image] > 0)
         numbers = [*answer.residual[image], answer.elevation[image], answer.elevation_sd[image]]
         cells = [_cell(value) if used else "" for value in numbers]
         number = "" if frame is None else int(frame[image])
-        rows.writerow([image, int(used), *cells, int(answer.at_bound[image] > 0), number])
-    return table.getvalue()
+        rows.append((image, int(used), *cells, int(answer.at_bound[image] > 0), number))
+    return csv_text(rows)
 
 
 def _test_table(record: dict[str, Any]) -> str:
     frame = record["test_frame"]
-    table = io.StringIO()
-    rows = csv.writer(table, lineterminator="\n")
-    rows.writerow(TEST_COLUMNS)
+    rows: list[tuple[object, ...]] = [TEST_COLUMNS]
     for image, residual in enumerate(record["test_residual_mm"]):
         cells = [""] * 4 if residual is None else [*residual, math.hypot(*residual)]
         number = "" if frame is None else frame[image]
-        rows.writerow([image, int(residual is not None), *cells, number])
-    return table.getvalue()
+        rows.append((image, int(residual is not None), *cells, number))
+    return csv_text(rows)
 
 
 def _cell(value: np.floating) -> str:

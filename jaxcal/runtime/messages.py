@@ -13,6 +13,11 @@ def shown(value: object) -> str:
     return quoted(value) if isinstance(value, str) else quoted(repr(value))[1:-1]
 
 
+def counted(count: int, noun: str, one: str = "", several: str = "") -> str:
+    """A number with its noun and verb, ``1 image is`` or ``2 images are``."""
+    return f"{count} {noun} {one}".rstrip() if count == 1 else f"{count} {noun}s {several}".rstrip()
+
+
 def seconds(moment: float) -> str:
     """A time stamp, to the millisecond also where it counts from 1970, for a message."""
     return f"{moment:.3f} s"

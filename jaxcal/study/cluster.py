@@ -263,9 +263,10 @@ def compute_on_cluster(
                 continue
             chunk, *_ = handed_out.pop(future.key)
             if future.status == "error":
+                error = cast("Any", future.exception())
                 raise CalibrationError(
                     f"chunk {chunk.index} could not be computed on the cluster: "
-                    f"{_error_in_words(future)}"
+                    f"{type(error).__name__}: {one_line(error)[:300]}"
                 )
             arrays, maker = cast("Any", future.result())
             future.release()
@@ -273,8 +274,3 @@ def compute_on_cluster(
     # Dask tells of a lost scheduler by these, according to what was being done.
     except (OSError, CancelledError) as error:
         raise CalibrationError(_LOST) from error
-
-
-def _error_in_words(future: Future) -> str:
-    error = future.exception()
-    return f"{type(error).__name__}: {one_line(cast('Any', error))[:300]}"

@@ -17,12 +17,10 @@ If a host has several devices, each takes its share of a block.
 
 from __future__ import annotations
 
-import dataclasses
 from functools import cache
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array
@@ -35,9 +33,8 @@ from jaxcal.runtime.jax_modes import in_own_modes
 from jaxcal.solvers.plan import Options
 from jaxcal.solvers.start import ConventionalStart, conventional
 from jaxcal.study.interface import Chunk
-from jaxcal.study.laws import OffsetLaw
 from jaxcal.study.offsets import nominal_bound
-from jaxcal.study.simulation import Protocol
+from jaxcal.study.simulation import Protocol, join_protocol, split_protocol
 from jaxcal.study.spec import Condition, MethodSpec, Spec
 from jaxcal.study.trials import Experiments, Kind, experiments, solve
 
@@ -55,29 +52,6 @@ Devices = tuple[Any, ...]
 
 COMPONENTS = ("lateral", "range", "elevation")
 """Components of the SDs, in this order."""
-
-
-@dataclasses.dataclass(frozen=True)
-class ProblemShape:
-    """All that is static about a draw."""
-
-    law: OffsetLaw
-    images: int
-    test_images: int
-    probe: LinearProbe
-    tracked: bool
-
-    def protocol(self, numbers: dict[str, Any]) -> Protocol:
-        """The protocol with these numbers, which may be traced; a perfect tracker draws none."""
-        if not self.tracked:
-            numbers = numbers | {"tracker_mm": 0.0, "tracker_rad": 0.0}
-        return Protocol(
-            images=self.images,
-            test_images=self.test_images,
-            elevation_distribution=self.law,
-            probe=self.probe,
-            **numbers,
-        )
 
 
 @in_own_modes
@@ -130,11 +104,9 @@ class Block:
     def __init__(
         self, spec: Spec, condition: Condition, indices: np.ndarray, devices: Devices
     ) -> None:
-        self._condition, self._devices, self._indices = condition, devices, indices
-        self._seed = np.asarray(spec.seed, np.uint64)
-        self._shape = shape_of(condition, spec.probe)
-        self._numbers = numbers_of(condition)
-        drawn = draw_program(self._shape, devices)(indices, self._seed, self._numbers)
+        self._condition, self._devices = condition, devices
+        shape, numbers = split_protocol(protocol(condition, spec.probe))
+        drawn = draw_program(shape, devices)(indices, np.asarray(spec.seed, np.uint64), numbers)
         self.batch, self.truth, self.realised = drawn
         self._begun: dict[int, ConventionalStart] = {}
 
@@ -168,28 +140,20 @@ def bound_mm(method: MethodSpec, condition: Condition) -> float:
 
 def protocol(condition: Condition, probe: LinearProbe) -> Protocol:
     """The distributions of one condition."""
-    return shape_of(condition, probe).protocol(numbers_of(condition))
-
-
-def shape_of(condition: Condition, probe: LinearProbe) -> ProblemShape:
-    """What is static about a condition's draws."""
-    tracked = condition.tracker_mm > 0 or condition.tracker_deg > 0
-    law = condition.elevation_distribution
-    return ProblemShape(law, condition.images, condition.test_images, probe, tracked)
-
-
-def numbers_of(condition: Condition) -> dict[str, Any]:
-    """The numeric fields of its protocol."""
-    return {
-        "elevation_mm": condition.elevation_mm,
-        "noise_mm": condition.noise_mm,
-        "lateral_mm": condition.lateral_mm,
-        "depth_mm": (condition.depth_min_mm, condition.depth_max_mm),
-        "rotation_rad": float(np.radians(condition.rotation_deg)),
-        "test_fraction": condition.test_fraction,
-        "tracker_mm": condition.tracker_mm,
-        "tracker_rad": float(np.radians(condition.tracker_deg)),
-    }
+    return Protocol(
+        images=condition.images,
+        test_images=condition.test_images,
+        elevation_mm=condition.elevation_mm,
+        elevation_distribution=condition.elevation_distribution,
+        noise_mm=condition.noise_mm,
+        lateral_mm=condition.lateral_mm,
+        depth_mm=(condition.depth_min_mm, condition.depth_max_mm),
+        rotation_rad=float(np.radians(condition.rotation_deg)),
+        test_fraction=condition.test_fraction,
+        probe=probe,
+        tracker_mm=condition.tracker_mm,
+        tracker_rad=float(np.radians(condition.tracker_deg)),
+    )
 
 
 def _trials(value: Array) -> np.ndarray:
@@ -228,12 +192,11 @@ def compile_pieces(function: Any, devices: Devices, *, pieces: int) -> Any:
 
 
 @cache
-def draw_program(shape: ProblemShape, devices: Devices) -> Any:
+def draw_program(shape: Protocol, devices: Devices) -> Any:
     """From (trial indices, seed, numbers) to :func:`jaxcal.study.trials.experiments`, compiled."""
 
     def program(indices: Array, seed: Array, numbers: dict[str, Any]) -> Any:
-        given = shape.protocol(jax.tree.map(jnp.asarray, numbers))
-        return experiments(trial_keys(indices, seed), given)
+        return experiments(trial_keys(indices, seed), join_protocol(shape, numbers))
 
     return compile_pieces(program, devices, pieces=1)
 

@@ -8,13 +8,12 @@ on the same experiment.
 
 from __future__ import annotations
 
-import csv
-import io
 from dataclasses import asdict, dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jaxcal.io.table import csv_text
 from jaxcal.result.calibration import Status
 from jaxcal.study.pipeline import bound_mm
 from jaxcal.study.spec import Condition, Spec
@@ -167,15 +166,13 @@ def as_record(store: Store[Spec], cells: list[Cell]) -> dict[str, Any]:
 
 def as_csv(spec: Spec, cells: list[Cell]) -> str:
     """The table as CSV: one line for each condition and method; all fields of the conditions."""
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
     axes, columns = [name for name, _ in spec.axes], [field.name for field in fields(Row)]
-    writer.writerow([*axes, *columns])
+    rows = [[*axes, *columns]]
     for cell in cells:
         condition = [_short(getattr(cell.condition, name)) for name in axes]
         for row in cell.rows:
-            writer.writerow([*condition, *(_short(getattr(row, name)) for name in columns)])
-    return stream.getvalue()
+            rows.append([*condition, *(_short(getattr(row, name)) for name in columns)])
+    return csv_text(rows)
 
 
 def as_table(spec: Spec, cells: list[Cell]) -> Table:

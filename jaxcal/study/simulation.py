@@ -14,6 +14,7 @@ fit, which is what an image would show.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -451,7 +452,7 @@ def times_of_flight(
     return counted / clock_hz
 
 
-NUMBERS = (
+NUMBERS: tuple[str, ...] = (
     "elevation_mm",
     "noise_mm",
     "lateral_mm",
@@ -465,12 +466,26 @@ NUMBERS = (
 """Fields of a protocol that are arguments of a program, so that one serves all their values."""
 
 
+def split_protocol(protocol: Protocol) -> tuple[Protocol, dict[str, np.ndarray]]:
+    """What a program that draws is compiled for, and the numbers that are its arguments.
+
+    A perfect tracker has no numbers, since nothing is drawn for it.
+    """
+    names = NUMBERS if _tracked(protocol) else NUMBERS[:-2]
+    shape = replace(protocol, **{name: getattr(Protocol, name) for name in NUMBERS})
+    return shape, {name: np.asarray(getattr(protocol, name), np.float64) for name in names}
+
+
+def join_protocol(shape: Protocol, numbers: Mapping[str, Any]) -> Protocol:
+    """The protocol of :func:`split_protocol`, whose numbers may be traced now."""
+    shallow, deep = numbers["depth_mm"]
+    return replace(shape, **{**numbers, "depth_mm": (shallow, deep)})
+
+
 def _drawn(seed: int, protocol: Protocol) -> Experiment:
     """One experiment; on a CPU by a program that is kept."""
-    names = NUMBERS if _tracked(protocol) else NUMBERS[:-2]
-    sizes = tuple(np.asarray(getattr(protocol, name), np.float64) for name in names)
-    shape = replace(protocol, **{name: getattr(Protocol, name) for name in NUMBERS})
-    arguments = (np.asarray(seed, np.int64), sizes)
+    shape, numbers = split_protocol(protocol)
+    arguments = (np.asarray(seed, np.int64), tuple(numbers.values()))
     if jax.default_backend() != "cpu":
         return jax.jit(_from_numbers, static_argnums=2)(*arguments, shape)
     label = {"method": "simulation", "images": protocol.images}
@@ -480,8 +495,7 @@ def _drawn(seed: int, protocol: Protocol) -> Experiment:
 def _from_numbers(seed: Int[Array, ""], sizes: tuple[Array, ...], shape: Protocol) -> Experiment:
     """Draw an experiment of a protocol whose numbers are traced."""
     numbers = dict(zip(NUMBERS, sizes, strict=False))  # a perfect tracker has no sizes
-    shallow, deep = numbers.pop("depth_mm")
-    return simulate(jax.random.key(seed), replace(shape, depth_mm=(shallow, deep), **numbers))
+    return simulate(jax.random.key(seed), join_protocol(shape, numbers))
 
 
 @in_own_modes

@@ -16,6 +16,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from functools import cache
 from typing import Any, BinaryIO
 
@@ -31,7 +32,6 @@ MOST_DEATHS = 3
 """Workers that may die over one chunk before the study gives up."""
 
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
-_POLL_S = 0.2
 
 
 class Worker:
@@ -122,85 +122,53 @@ def compute_on_workers(
     Raises:
         CalibrationError: a chunk could not be computed, or killed its workers.
     """
-    crew = _Crew(spec, chunks, groups)
-    crew.start()
-    try:
-        for _ in chunks:
-            yield crew.next_done()
-    finally:
-        crew.end()
+    ahead, waiting, pending = 2 * len(groups), list(reversed(chunks)), set()
+    with ThreadPoolExecutor(len(groups)) as pool, _Crew(spec, groups) as crew:
+        while waiting or pending:
+            # Not all at once: a slow disk would fill this process's memory with results.
+            while waiting and len(pending) < ahead:
+                pending.add(pool.submit(crew.compute, waiting.pop()))
+            done, pending = wait(pending, return_when=FIRST_COMPLETED)
+            for future in done:
+                yield future.result()
 
 
 class _Crew:
-    """A thread for each worker process: it takes chunks that wait, and hands over what is done."""
+    """The worker processes, each of which computes for one thread at a time; a context manager."""
 
-    def __init__(self, spec: Study, chunks: list[Chunk], groups: list[set[int]]) -> None:
+    def __init__(self, spec: Study, groups: list[set[int]]) -> None:
         self._spec, self._groups = spec, groups
-        self._waiting: queue.SimpleQueue[Chunk] = queue.SimpleQueue()
-        for chunk in chunks:
-            self._waiting.put(chunk)
-        # Bounded, so that a slow disk does not fill this process's memory.
-        self._done: queue.Queue[Any] = queue.Queue(maxsize=len(groups))
-        self._ending = threading.Event()
         self._workers: dict[int, Worker] = {}
-        self._threads = [
-            threading.Thread(
-                target=self._drive, args=(place,), daemon=True, name=f"study worker {place}"
-            )
-            for place in range(len(groups))
-        ]
+        self._ending = threading.Event()
+        self._idle: queue.SimpleQueue[int] = queue.SimpleQueue()
+        for place in range(len(groups)):
+            self._idle.put(place)
 
-    def start(self) -> None:
-        for thread in self._threads:
-            thread.start()
+    def __enter__(self) -> _Crew:
+        return self
 
-    def next_done(self) -> tuple[Chunk, *Results]:
-        """Wait for a chunk's results, or raise what one of the threads met."""
-        result = self._done.get()
-        if isinstance(result, Exception):
-            raise result
-        return result
-
-    def end(self) -> None:
-        """Kill the workers and wait for the threads."""
+    def __exit__(self, *_: object) -> None:
         self._ending.set()
-        for thread in self._threads:
-            # Killed again and again, since the thread may just have started a worker.
-            while thread.is_alive():
-                for worker in list(self._workers.values()):
-                    worker.process.kill()
-                thread.join(_POLL_S)
         for worker in list(self._workers.values()):
             worker.end()
 
-    def _drive(self, place: int) -> None:
-        try:
-            while not self._ending.is_set():
-                chunk = self._waiting.get_nowait()
-                self._hand_over((chunk, *self._computed(place, chunk)))
-        except queue.Empty:
-            return
-        except Exception as error:
-            self._hand_over(error)
-
-    def _hand_over(self, result: Any) -> None:
-        while not self._ending.is_set():
-            with contextlib.suppress(queue.Full):
-                self._done.put(result, timeout=_POLL_S)
-                return
-
-    def _computed(self, place: int, chunk: Chunk) -> Results:
+    def compute(self, chunk: Chunk) -> tuple[Chunk, *Results]:
         """A chunk's results; a worker that dies is replaced."""
-        for _ in range(MOST_DEATHS):
-            if place not in self._workers:
-                self._workers[place] = Worker(self._spec, self._groups[place])
-            found = self._workers[place].compute(chunk)
-            if found is not None:
-                return found
-            self._workers.pop(place).end()
-            if self._ending.is_set():
-                break
-        raise CalibrationError(f"chunk {chunk.index}: {MOST_DEATHS} workers died computing it")
+        place = self._idle.get()
+        try:
+            for _ in range(MOST_DEATHS):
+                if self._ending.is_set():
+                    break
+                if place not in self._workers:
+                    self._workers[place] = Worker(self._spec, self._groups[place])
+                # Ended meanwhile, it may have been too late to be among those that were killed.
+                found = None if self._ending.is_set() else self._workers[place].compute(chunk)
+                if found is not None:
+                    return chunk, *found
+                self._workers.pop(place).end()
+            raise CalibrationError(f"chunk {chunk.index}: {MOST_DEATHS} workers died computing it")
+        finally:
+            self._idle.put(place)
 
 
 def core_groups(workers: int) -> list[set[int]]:

@@ -351,7 +351,9 @@ def _localise_one(
         )
     if margin < minimum_margin_db:
         raise NotFoundError(
-            f"ambiguous: the next bright spot is only {margin:.1f} dB below", contrast, margin
+            f"ambiguous, several bright spots: the next is only {margin:.1f} dB below",
+            contrast,
+            margin,
         )
     if shape.sum() < 3:
         raise NotFoundError("a single bright pixel, not a spot", contrast, margin)

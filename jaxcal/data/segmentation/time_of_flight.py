@@ -149,13 +149,11 @@ def fit_out_of_plane(
     Returns:
         The in-plane fits (from which these start) and the fits with the elevation squared.
     """
-    d, m, ex, ez = _cleaned(distances, element_positions)
-    lines, x, z = _closed_form(d, m, ex, ez)
-    start = _Values(x, z, jnp.zeros_like(x), jnp.zeros_like(x))
-    plane = _iterate(start, d, m, ex, ez, lines, robust=robust, steps=steps, out_of_plane=False)
+    plane = fit_in_plane(distances, element_positions, robust=robust, steps=steps)
     x, z = plane.position[..., 0], plane.position[..., 1]
     start = _Values(x, z, jnp.zeros_like(x), plane.noise)
-    full = _iterate(start, d, m, ex, ez, lines, robust=robust, steps=steps, out_of_plane=True)
+    cleaned = _cleaned(distances, element_positions)
+    full = _iterate(start, *cleaned, plane.lines, robust=robust, steps=steps, out_of_plane=True)
     return plane, full
 
 
