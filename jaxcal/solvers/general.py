@@ -218,17 +218,25 @@ def arrow_least_squares(
         raise InputError(f"residual must return a ({rows or 'n'}, columns) array, not {got}")
     bound = _bound(limit, rows).astype(flat.dtype)
 
-    def function(unknowns: tuple[Array, Array], args: Any) -> Float[Array, "n columns"]:
-        return residual(unravel(unknowns[0]), unknowns[1], args)
-
     solver = _ArrowSolver(
         tolerance=default_tolerance(flat.dtype) if tolerance is None else tolerance,
         damping=damping,
         limit=bound,
     )
+    function = _FlatResidual(residual, unravel)
     solution = optx.least_squares(function, solver, first, args, max_steps=max_steps, throw=throw)
     found = solution.value
     return eqx.tree_at(lambda s: s.value, solution, (unravel(found[0]), found[1]))
+
+
+class _FlatResidual(eqx.Module):
+    """Residuals of flat shared unknowns: equal for equal ``residual``, so compiled once."""
+
+    residual: Callable[[Any, Array, Any], Array]
+    unravel: Callable[[Array], Any] = eqx.field(static=True)
+
+    def __call__(self, unknowns: tuple[Array, Array], args: Any) -> Float[Array, "n columns"]:
+        return self.residual(self.unravel(unknowns[0]), unknowns[1], args)
 
 
 def _bound(limit: Any, rows: int) -> Float[Array, " n"]:
