@@ -63,6 +63,11 @@ def test_batches_and_traces_print_without_a_verdict(recording):
     assert batch._repr_html_() is None
     one = jaxcal.calibrate(problem, "conventional")
     np.testing.assert_allclose(batch.image_to_probe[1], one.image_to_probe, atol=1e-9)
+    assert [each.status for each in batch] == ["converged"] * 2
+    with pytest.raises(jaxcal.InputError, match="one calibration, not a batch"):
+        list(one)
+    with pytest.raises(jaxcal.InputError, match="take one of them"):
+        batch.verdict()
     seen = []
     jax.jit(lambda p: seen.append(str(jaxcal.calibrate(p, "conventional"))))(problem)
     assert seen[0].startswith("Calibration(")
