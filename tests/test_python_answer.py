@@ -147,6 +147,8 @@ def test_lists_and_single_names(recording):
     problem = jaxcal.Problem.from_recording(recording)
     with pytest.raises(jaxcal.InputError, match=r"not 2: jaxcal\.calibrate_batch takes a list"):
         as_problem([problem, problem], "jaxcal.calibrate")
+    with pytest.raises(jaxcal.InputError, match="not generator"):
+        jaxcal.calibrate_batch(each for each in [problem])
     with pytest.raises(jaxcal.InputError, match="the list is empty"):
         jaxcal.calibrate_batch([])
     # A single name is one name, and not its letters.
