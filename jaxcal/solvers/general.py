@@ -88,9 +88,8 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             their Jacobian.
         damping: first lambda, relative to the diagonal.
         rtol: without effect; optimistix asks every solver for it.
-        atol: without effect, but ``optimistix.root_find`` takes a root for found only where the
-            residuals' ``norm`` is below it, so never with the default.
-        norm: as ``atol``.
+        atol: without effect, as ``rtol``.
+        norm: without effect, as ``rtol``.
 
     Raises:
         InputError: a tolerance or damping below zero, or one that is no number.
