@@ -209,13 +209,22 @@ def test_what_the_pieces_cannot_take_is_said_in_a_sentence():
 
 
 def test_local_unknowns_reach_their_minimum_where_the_shared_gradient_is_zero():
-    """At s = 0 the gradient of s is zero from the start, but l = ln 2 is far away."""
+    """At s = 0 the gradient of s is zero from the start, but the local ones' minimum is far away.
 
-    def residual(shared, local, args):
-        del args
-        return jnp.stack([jnp.exp(local) - 2 + shared, 3 * shared + 0 * local], axis=1)
+    An undamped step to ln 10 goes to 9. The same residual of other data is traced for its shape
+    alone: the program is there already.
+    """
+    traces = []
 
-    solution = arrow_least_squares(residual, jnp.asarray(0.0), np.zeros(4))
-    shared, local = solution.value
-    np.testing.assert_allclose(shared, 0, atol=1e-12)
-    np.testing.assert_allclose(local, np.log(2), atol=1e-9)
+    def residual(shared, local, size):
+        traces.append(size)
+        return jnp.stack([jnp.exp(local) - size + shared, 3 * shared + 0 * local], axis=1)
+
+    for size in (2.0, 10.0):
+        before = len(traces)
+        shared, local = arrow_least_squares(
+            residual, jnp.asarray(0.0), np.zeros(4), jnp.asarray(size)
+        ).value
+        np.testing.assert_allclose(shared, 0, atol=1e-12)
+        np.testing.assert_allclose(local, np.log(size), atol=1e-9)
+    assert len(traces) - before == 1

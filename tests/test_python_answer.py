@@ -18,6 +18,7 @@ from jaxcal.data.problem import as_problem
 from jaxcal.report import plots
 from jaxcal.report.record import calibration_record
 from jaxcal.result.saved import load_calibration
+from jaxcal.runtime.jax_modes import inside_transformation
 
 
 @pytest.fixture(scope="module")
@@ -63,6 +64,11 @@ def test_batches_and_traces_print_without_a_verdict(recording):
     assert batch._repr_html_() is None
     one = jaxcal.calibrate(problem, "conventional")
     np.testing.assert_allclose(batch.image_to_probe[1], one.image_to_probe, atol=1e-9)
+    assert [each.status for each in batch] == ["converged"] * 2
+    with pytest.raises(jaxcal.InputError, match="one calibration, not a batch"):
+        list(one)
+    with pytest.raises(jaxcal.InputError, match="take one of them"):
+        batch.verdict()
     seen = []
     jax.jit(lambda p: seen.append(str(jaxcal.calibrate(p, "conventional"))))(problem)
     assert seen[0].startswith("Calibration(")
@@ -142,6 +148,7 @@ def test_lists_and_single_names(recording):
     problem = jaxcal.Problem.from_recording(recording)
     with pytest.raises(jaxcal.InputError, match=r"not 2: jaxcal\.calibrate_batch takes a list"):
         as_problem([problem, problem], "jaxcal.calibrate")
+    assert not inside_transformation(each for each in [problem])  # without a warning of JAX
     with pytest.raises(jaxcal.InputError, match="the list is empty"):
         jaxcal.calibrate_batch([])
     # A single name is one name, and not its letters.

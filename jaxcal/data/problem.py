@@ -298,8 +298,9 @@ def stack(problems: list[Problem]) -> Problem:
         if is_traced(*leaves):
             return jnp.stack(leaves)
         # By numpy: jax.numpy.stack of thousands of arrays takes minutes to compile.
-        kept = [leaf.sharding for leaf in leaves[:1] if isinstance(leaf, jax.Array)]
-        return jax.device_put(np.stack(leaves), *kept)
+        # A batch committed to one device would not be divided among all of them.
+        kept = [leaf.sharding for leaf in leaves if isinstance(leaf, jax.Array) and leaf.committed]
+        return jax.device_put(np.stack(leaves), *kept[:1])
 
     return jax.tree.map(stacked, *problems)
 

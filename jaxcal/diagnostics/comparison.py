@@ -64,7 +64,8 @@ def compare_calibrations(
     nearer to each other than is expected here. The marker on the probe must be the same.
 
     Args:
-        first: a calibration, e.g. from :func:`jaxcal.load_calibration`.
+        first: a calibration, from :func:`jaxcal.load_calibration` or a result's
+            ``image_transform()``.
         second: another one; both take pixels, or both points in mm.
         points: [u, v] of image points, px, or [lateral, range] in mm.
 
@@ -73,7 +74,7 @@ def compare_calibrations(
             or points that :meth:`ImageTransform.apply` refuses.
     """
     for name, each in (("first", first), ("second", second)):
-        check_made(name, each, ImageTransform, "jaxcal.load_calibration")
+        check_made(name, each, ImageTransform, "load_calibration or image_transform()")
         each.check_usable()
     if (first.scale_mm_per_px is None) != (second.scale_mm_per_px is None):
         without, other = first, second

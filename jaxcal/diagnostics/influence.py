@@ -31,7 +31,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxcal import CalibrationError
+from jaxcal import CalibrationError, InputError
 from jaxcal.diagnostics.image_errors import (
     ImageErrors,
     Unknowns,
@@ -110,14 +110,15 @@ def influence_of(calibration: Calibration) -> Influence:
     """Influence of the images of one calibration, with concrete values.
 
     Raises:
-        CalibrationError: a batch, or a calibration without its problem.
+        CalibrationError: a calibration without its problem.
+        InputError: a batch.
     """
     if calibration.problem is None:
         raise CalibrationError(
             "this calibration does not hold its problem: add it with calibration.with_problem"
         )
     if np.ndim(calibration.mask) != 1:
-        raise CalibrationError("a batch holds many calibrations: take one of them")
+        raise InputError("a batch holds many calibrations: take one of them")
     alone = map_arrays(_first, calibration.numpy())
     with np.errstate(all="ignore"):
         found = whitened_errors(alone)

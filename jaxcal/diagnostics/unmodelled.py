@@ -176,11 +176,14 @@ def _tuned(
     scale = 1 / np.sqrt(np.maximum(np.sum(rows**2, axis=(0, 1)), 1e-300))
     variance = np.ones(3)
     step = np.zeros(rows.shape[-1])
-    left = errors
+    # The triangle of each kind's rows and errors has the same sums of squares as all images.
+    count, both = len(errors), np.concatenate([rows, errors[..., None]], axis=-1)
+    both = np.linalg.qr(np.swapaxes(both, 0, 1), mode="r")
+    rows, errors = np.swapaxes(both[..., :-1], 0, 1), both[..., -1].T
     for _ in range(_ROUNDS):
         weight = 1 / np.sqrt(variance)[:, None]
         design = (rows * scale * weight).reshape(-1, rows.shape[-1])
         step = -scale * np.linalg.lstsq(design, (errors * weight[:, 0]).ravel(), rcond=1e-12)[0]
         left = errors + rows @ step
-        variance = np.maximum(np.mean(left**2, axis=0), 1e-12)
+        variance = np.maximum(np.sum(left**2, axis=0) / count, 1e-12)
     return variance, step

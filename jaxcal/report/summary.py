@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxcal import CalibrationError
+from jaxcal import CalibrationError, InputError
 from jaxcal.data.recording import Images, Recording
 from jaxcal.report.record import calibration_record
 from jaxcal.result.calibration import Calibration
@@ -22,7 +22,8 @@ def recording_of(calibration: Calibration) -> Recording:
     """The data of a calibration, as a recording.
 
     Raises:
-        CalibrationError: a calibration without its problem, or a batch.
+        CalibrationError: a calibration without its problem.
+        InputError: a batch.
     """
     answer = calibration.numpy()
     problem = answer.problem
@@ -31,7 +32,7 @@ def recording_of(calibration: Calibration) -> Recording:
             "this calibration does not hold its problem: add it with calibration.with_problem"
         )
     if np.ndim(answer.mask) != 1:
-        raise CalibrationError("a batch holds many calibrations: take one of them, batch[0]")
+        raise InputError("a batch holds many calibrations: take one of them, batch[0]")
     mask = np.asarray(problem.mask) > 0
     used = mask[:, None]
     spacing = None

@@ -378,8 +378,11 @@ class Calibration:
         """Some calibrations of a batch.
 
         Raises:
-            IndexError: beyond the batch, or for one calibration.
+            IndexError: beyond the batch.
+            InputError: for one calibration, so that a loop over it does not end silently.
         """
+        if self.mask.ndim == 1:
+            raise InputError("this is one calibration, not a batch of them: it has no parts")
         # Numpy raises an error for an index outside the batch; JAX would clip it.
         np.empty(self.mask.shape[:-1])[index]
 

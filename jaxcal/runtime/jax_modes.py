@@ -59,7 +59,9 @@ def inside_transformation(*arguments: object) -> bool:
 
     # Under jit even a constant is a tracer; under vmap and grad only what depends on an argument.
     # device_put, since jax.numpy.zeros would be compiled.
-    leaves = jax.tree.leaves((arguments, jax.device_put(np.float32(0))))
+    marked = (arguments, jax.device_put(np.float32(0)))
+    # JAX warns of an iterator, and what it yields cannot be looked at.
+    leaves = jax.tree.leaves(marked, is_leaf=lambda node: isinstance(node, Iterator))
     return any(isinstance(leaf, jax.core.Tracer) for leaf in leaves)
 
 

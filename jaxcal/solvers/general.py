@@ -12,7 +12,8 @@ by scalar divisions,
     dy_i = -(d_i + E_i' dx) / D_i,
 
 with A, g of the shared unknowns, D_i, d_i of the local ones and E_i between them: O(n p^2) a step
-where a dense solver takes O(n (n + p)^2).
+where a dense solver takes O(n (n + p)^2). D_i is damped like the diagonal of A, with the lambda of
+the step before.
 
 Reference: Triggs, McLauchlan, Hartley, Fitzgibbon, "Bundle adjustment: a modern synthesis", 2000,
 section 6.
@@ -218,17 +219,25 @@ def arrow_least_squares(
         raise InputError(f"residual must return a ({rows or 'n'}, columns) array, not {got}")
     bound = _bound(limit, rows).astype(flat.dtype)
 
-    def function(unknowns: tuple[Array, Array], args: Any) -> Float[Array, "n columns"]:
-        return residual(unravel(unknowns[0]), unknowns[1], args)
-
     solver = _ArrowSolver(
         tolerance=default_tolerance(flat.dtype) if tolerance is None else tolerance,
         damping=damping,
         limit=bound,
     )
+    function = _FlatResidual(residual, unravel)
     solution = optx.least_squares(function, solver, first, args, max_steps=max_steps, throw=throw)
     found = solution.value
     return eqx.tree_at(lambda s: s.value, solution, (unravel(found[0]), found[1]))
+
+
+class _FlatResidual(eqx.Module):
+    """Residuals of flat shared unknowns: equal for equal ``residual``, so compiled once."""
+
+    residual: Callable[[Any, Array, Any], Array]
+    unravel: Callable[[Array], Any] = eqx.field(static=True)
+
+    def __call__(self, unknowns: tuple[Array, Array], args: Any) -> Float[Array, "n columns"]:
+        return self.residual(self.unravel(unknowns[0]), unknowns[1], args)
 
 
 def _bound(limit: Any, rows: int) -> Float[Array, " n"]:
@@ -250,12 +259,13 @@ class _ArrowSolver(LevenbergMarquardt):
     def init(
         self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any
     ) -> tuple[Descent, Rounding, Any]:
-        return self._before(self._at(fn, y, args)[0], *fn(y, args))
+        return self._before(self._at(fn, y, args, self.damping)[0], *fn(y, args))
 
     def step(self, fn: Any, y: Any, args: Any, options: Any, state: Any, tags: Any) -> tuple:
         descent, rounding, aux = state
         here = descent.candidate
-        candidate, normal = self._at(fn, (here.shared[:, 0], here.local[:, 0]), args)
+        at = here.shared[:, 0], here.local[:, 0]
+        candidate, normal = self._at(fn, at, args, descent.damping)
         # The candidate's own derivatives say how its local unknowns follow the next step.
         descent = eqx.tree_at(lambda state: state.candidate, descent, candidate)
         after = iterate_once(
@@ -277,7 +287,9 @@ class _ArrowSolver(LevenbergMarquardt):
         )
         return (iterate.shared[:, 0], iterate.local[:, 0]), (after, rounding, aux), aux
 
-    def _at(self, fn: Any, y: tuple[Array, Array], args: Any) -> tuple[Flat, NormalEquations]:
+    def _at(
+        self, fn: Any, y: tuple[Array, Array], args: Any, damping: Array | float
+    ) -> tuple[Flat, NormalEquations]:
         """The unknowns with their derivatives, and the normal equations without local unknowns."""
 
         def residual(shared: Array, local: Array) -> Array:
@@ -292,7 +304,8 @@ class _ArrowSolver(LevenbergMarquardt):
         diagonal, pull = jnp.sum(own**2, axis=1), jnp.sum(own * value, axis=1)
         coupling = jnp.einsum("anm,nm->na", jacobian, own)
         held = (y[1] >= self.limit) & (pull <= 0) | (y[1] <= -self.limit) & (pull >= 0)
-        give = jnp.where(held | (diagonal <= 0), 0.0, 1 / jnp.where(diagonal > 0, diagonal, 1.0))
+        damped = jnp.where(diagonal > 0, diagonal * (1 + damping), 1.0)
+        give = jnp.where(held | (diagonal <= 0), 0.0, 1 / damped)
         shared = jnp.einsum("anm,bnm->ab", jacobian, jacobian)
         gradient = jnp.einsum("anm,nm->a", jacobian, value)
         cost = jnp.sum(value**2)

@@ -33,7 +33,10 @@ STILL_MM, STILL_RAD = 1e-6, 1e-8
 
 @jax.custom_jvp
 def implicit_tangent(
-    iterate: Iterate, observation: Observation, images: ImagePlanes, medium: MediumPrior | None
+    iterate: Iterate,
+    observation: Observation,
+    images: ImagePlanes,
+    medium: MediumPrior | None = None,
 ) -> Float[Array, "p batch"]:
     """How the minimiser of an objective moves with the data and with given numbers.
 

@@ -399,7 +399,7 @@ def accumulate(
     iterate: Iterate,
     observation: Observation,
     images: ImagePlanes,
-    exact: Float[Array, " batch"] | None,
+    exact: Float[Array, " batch"] | None = None,
     medium: MediumPrior | None = None,
 ) -> NormalEquations:
     """One pass: the normal equations at an iterate.
