@@ -60,16 +60,6 @@ def again_and_again(
         time.sleep(0.002)
 
 
-def test_ur_rtde_gives_the_same_poses():
-    pytest.importorskip("rtde_receive", reason="ur_rtde has no wheel for this platform")
-    with EmulatedRobot(version=CB_SERIES) as robot:
-        with PoseStream(robot.host, clock=robot.clock, client="ur_rtde") as poses:
-            sample = poses.latest()
-            assert poses.tcp_offset is None
-        assert sample.raw == pytest.approx(START)
-        assert sample.t_device > 1000.0
-
-
 def test_identity_and_tcp_offset():
     with EmulatedRobot() as robot, PoseStream(robot.host, clock=robot.clock) as poses:
         identity = poses.identity()
@@ -354,11 +344,8 @@ def packet(pose: tuple[float, ...]) -> bytes:
 def test_packets_that_do_not_fit_the_recipe_end_the_connection(payload):
     opening = [rtde(b"V", b"\x01"), VERSION, rtde(b"O", TYPES), rtde(b"S", b"\x01")]
     host = answers(*opening[:-1], opening[-1] + rtde(b"M", b"text") + rtde(b"U", payload))
-    with (
-        contextlib.closing(PacketReader(host, timeout_s=30.0)) as reader,
-        pytest.raises(LostError, match=r"bytes came instead|NaN|impossible pose"),
-    ):
-        again_and_again(reader.read)
+    with pytest.raises(LostError, match=r"bytes came instead|NaN|impossible pose"):
+        PacketReader(host, timeout_s=30.0)
 
 
 def test_a_faster_bench_counts_age_in_its_own_time():

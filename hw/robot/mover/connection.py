@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import signal
 import threading
 
@@ -86,7 +85,7 @@ class Connection:
     def _read_packets(self) -> None:
         reader = PacketReader(self._setup.host)
         asked_s, stamp_s = reader.bound
-        lag = Lag(self._clock.at(asked_s), stamp_s) if math.isfinite(asked_s) else Lag()
+        lag = Lag(self._clock.at(asked_s), stamp_s)
         oldest = self._clock.patience(self._setup.plan.limits.max_pose_age_s)
         problem = too_late(reader.latency_s * self._clock.speed, oldest)
         if problem is not None:

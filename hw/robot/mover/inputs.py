@@ -118,17 +118,7 @@ class Inputs:
         self._unseen.append(packet)
         # In every packet: the newest one may already tell of another program.
         self.program_ended |= self.program_started and not packet.program
-        t_host = self._clock.at(packet.monotonic_s)
-        self._sample = PoseSample(
-            t_host,
-            packet.timestamp_s,
-            packet.tcp_pose,
-            packet.safety_bits,
-            packet.robot_mode,
-            packet.runtime_state,
-            self._lag.of(t_host, packet.timestamp_s),
-            packet.joints,
-        )
+        self._sample = PoseSample.of(packet, self._clock, self._lag)
         changed = "" if self._pendant is None else self._pendant.changed(packet.pendant)
         if changed:
             self._refuse(f"changed at the pendant: {changed}")
