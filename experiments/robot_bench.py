@@ -56,7 +56,7 @@ LIMITS = Limits(
     search_deg=0.5,
 )
 FAULTS = (
-    "mute", "drop", "drop control", "protective_stop", "force", "set_tcp_offset", "guard", "stop",
+    "mute", "drop", "drop control", "protective_stop", "force", "tcp_offset", "guard", "stop",
     "kill the mover", "silent caller",
 )  # fmt: skip
 
@@ -111,7 +111,7 @@ def fault(name: str) -> tuple[float, float, str]:
             "stop": lambda: motion.stop("the operator pressed stop"),
             "kill the mover": lambda: os.kill(mover, signal.SIGKILL),
             "force": lambda: robot.ask("force", [0.0, 0.0, -40.0, 0.0, 0.0, 0.0]),
-            "set_tcp_offset": lambda: robot.ask(name, [0.0, 0.0, 0.2, 0.0, 0.0, 0.0]),
+            "tcp_offset": lambda: robot.ask(name, [0.0, 0.0, 0.2, 0.0, 0.0, 0.0]),
         }
         with ThreadPoolExecutor(1) as pool:
             future = pool.submit(motion.move_to, PLAN.targets[1])

@@ -29,6 +29,16 @@ from jaxcal.runtime.array_types import Float
 VERSIONS = {125: CB_SERIES, 500: E_SERIES}
 """Controllers that the real client accepts, by their rate: a CB-series and an e-Series."""
 
+_OF_THE_ROBOT: dict[str, tuple[str, ...]] = {
+    **dict.fromkeys(("mute", "drop", "protective_stop", "unlock"), ()),
+    "robot_state": ("robot_mode", "safety_mode"),
+    "remote": ("on",),
+    "tcp_offset": ("offset",),
+    "payload": ("mass_kg",),
+    "speed_slider": ("fraction",),
+}
+"""Faults of the robot (:meth:`hw.bench.rtde.RtdeServer.act`), and the names of their values."""
+
 _ADDRESS_TRIES = 8
 _HOVER_MM = 70.0
 
@@ -240,38 +250,33 @@ class Assembly:
     # Requests
 
     def _table(self) -> dict[str, Callable[..., object]]:
-        def robot() -> RobotProcess:
-            assert self.robot is not None
-            return self.robot
-
+        echo, images = self.echo, self.images
         return {
-            "mute": lambda: robot().mute(True),
-            "drop": lambda: robot().drop(),
-            "protective_stop": lambda: robot().protective_stop(),
-            "unlock": lambda: robot().unlock(),
-            "robot_state": lambda robot_mode, safety_mode: robot().enter(robot_mode, safety_mode),
-            "remote": lambda on: robot().ask("set_remote", bool(on)),
-            "payload": lambda mass_kg: robot().set_payload(float(mass_kg)),
-            "speed_slider": lambda fraction: robot().set_speed_slider(float(fraction)),
-            "tcp_offset": lambda offset: robot().set_tcp_offset(tuple(map(float, offset))),
-            "crc_errors": lambda rate: self.echo.crc_errors(float(rate)),
-            "miss_triggers": lambda rate: self.echo.miss_triggers(float(rate)),
-            "miss_lines": lambda rate: self.echo.miss_lines(float(rate)),
-            "echo_stale": lambda: self.echo.stale(True),
-            "echo_mute": lambda: self.echo.mute(True),
-            "unplug": lambda: self.echo.unplug(),
-            "replug": lambda: self.echo.replug(),
-            "image_stale": lambda: self.images.stale(True),
-            "image_freeze": lambda: self.images.freeze(True),
-            "image_drop": lambda: self.images.drop(),
-            "image_corrupt": lambda rate: self.images.corrupt(float(rate)),
+            "crc_errors": lambda rate: echo.fault(crc_errors=float(rate)),
+            "miss_triggers": lambda rate: echo.fault(missed_triggers=float(rate)),
+            "miss_lines": lambda rate: echo.fault(missed_lines=float(rate)),
+            "echo_stale": lambda: echo.fault(stale=True),
+            "echo_mute": lambda: echo.fault(mute=True),
+            "unplug": echo.unplug,
+            "replug": echo.replug,
+            "image_stale": lambda: images.fault(stale=True),
+            "image_freeze": lambda: images.fault(frozen=True),
+            "image_drop": images.drop,
+            "image_corrupt": lambda rate: images.fault(corrupt=float(rate)),
         }
 
     def _fault(self, request: dict) -> float:
         """Bench time at which the fault was in force."""
         name = request.pop("name", None)
+        if name in _OF_THE_ROBOT:
+            assert self.robot is not None
+            wanted = _OF_THE_ROBOT[name]
+            if set(request) != set(wanted):
+                raise TypeError(f"{name} takes {', '.join(wanted) or 'no values'}")
+            return self.robot.ask(name, *(request[key] for key in wanted))
         if name not in self._faults:
-            raise InputError(f"no fault {name!r}; there are: {', '.join(self._faults)}")
+            known = ", ".join([*_OF_THE_ROBOT, *self._faults])
+            raise InputError(f"no fault {name!r}; there are: {known}")
         self._faults[name](**request)
         if name == "unplug":
             self._unplugged = True
@@ -280,7 +285,7 @@ class Assembly:
     def _recover(self, _: dict) -> None:
         """End the devices' faults. A protective stop and changes at the pendant stay."""
         if self.robot is not None:
-            self.robot.mute(False)
+            self.robot.ask("unmute")
         if self._unplugged:
             self.echo.replug()
             self._unplugged = False

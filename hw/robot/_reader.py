@@ -11,9 +11,9 @@ import pickle
 import select
 import sys
 
-from hw.robot._process import RECEIVES, be_prompt
 from hw.robot.rtde import PacketReader
 from hw.runtime.errors import DeviceError, LostError
+from hw.runtime.processes import RECEIVES, be_prompt
 
 
 def main(host: str, frequency: str, timeout: str) -> None:

@@ -9,7 +9,6 @@ latency that was there from the start counts too.
 
 from __future__ import annotations
 
-import contextlib
 import pickle
 import subprocess
 import threading
@@ -22,12 +21,12 @@ from typing import IO, Any
 
 import numpy as np
 
-from hw.robot._process import spawn
 from hw.robot.identity import Identity, read_identity
 from hw.robot.pose import ur_to_pose
 from hw.robot.rtde import Packet, PendantSettings, too_late
 from hw.runtime.clock import REAL, Clock, Lag
 from hw.runtime.errors import DeviceError, LostError, StaleError, refused
+from hw.runtime.processes import spawn
 from hw.runtime.rigid import rotation_vector
 from jaxcal.runtime.array_types import Float
 
@@ -167,8 +166,7 @@ class PoseStream:
     def close(self) -> None:
         """End the process; poses already read can still be drained."""
         if self._process is not None:
-            with contextlib.suppress(ProcessLookupError):
-                self._process.kill()
+            self._process.kill()
             self._process.wait()
         if self._thread is not None:
             self._thread.join()

@@ -66,7 +66,7 @@ def test_identity_and_tcp_offset():
         assert (identity.serial, identity.model) == ("20195500042", "UR5")
         assert identity.version == "5.11.0.108249"
         assert poses.tcp_offset == (0.0, 0.0, 0.1, 0.0, 0.0, 0.0)
-        robot.ask("set_tcp_offset", [0.0, 0.0, 0.101, 0.0, 0.0, 0.0])
+        robot.ask("tcp_offset", [0.0, 0.0, 0.101, 0.0, 0.0, 0.0])
         with pytest.raises(RefusedError, match="TCP offset changed"):
             again_and_again(poses.latest)
     with (
@@ -104,8 +104,8 @@ def test_an_arm_is_known_by_its_serial_number_and_calibration(version, serial, c
 def test_payload_and_speed_slider_are_told():
     with EmulatedRobot() as robot, PoseStream(robot.host, clock=robot.clock) as poses:
         assert poses.pendant == PendantSettings(0.0, (0.0, 0.0, 0.0), 1.0)
-        robot.set_payload(0.8, (0.0, 0.0, 0.05))
-        robot.set_speed_slider(0.5)
+        robot.ask("payload", 0.8, (0.0, 0.0, 0.05))
+        robot.ask("speed_slider", 0.5)
         expected = PendantSettings(0.8, (0.0, 0.0, 0.05), 0.5)
         deadline = time.monotonic() + 120.0
         while poses.pendant != expected and time.monotonic() < deadline:

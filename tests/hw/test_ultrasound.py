@@ -159,12 +159,12 @@ def test_one_device_only() -> None:
 def test_stale_frozen_and_back(server: ImageServer) -> None:
     with connected(server) as stream:
         images_of(stream, 3)
-        server.stale()
+        server.fault(stale=True)
         with pytest.raises(StaleError, match="no new image from"):
             exhaust(stream, 1.0)
         server.recover()
         last = images_of(stream, 3)[-1]
-        server.freeze()
+        server.fault(frozen=True)
         until(lambda: stream.statistics().repeated > 3)
         with pytest.raises(StaleError, match="is the machine frozen"):
             exhaust(stream, 1.0)
@@ -194,11 +194,11 @@ def test_corrupted_images_are_counted(server: ImageServer) -> None:
     """Every image handed on is one that was made; those missing are counted."""
     with connected(server, queue=1000) as stream:
         first = stream.read(PATIENCE_S).frame_id
-        server.corrupt(0.4)
+        server.fault(corrupt=0.4)
         until(lambda: server.sent > 120)
         server.recover()
         images = images_of(stream, 60)
-        server.stale()
+        server.fault(stale=True)
         with contextlib.suppress(StaleError):
             while True:
                 images.append(stream.read(1.0))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import signal
 import threading
 
-from hw.robot._process import ASKS, RECEIVES, be_prompt
 from hw.robot.gate import Gate
 from hw.robot.identity import LOCAL, read_identity, stop_program, until_local
 from hw.robot.limits import numbers
@@ -18,6 +17,7 @@ from hw.robot.rtde import PROGRAM_RUNS, PacketReader, safety_text, state_text, t
 from hw.runtime.clock import Lag
 from hw.runtime.errors import LostError, refused
 from hw.runtime.extras import require
+from hw.runtime.processes import ASKS, RECEIVES, be_prompt
 
 _END_S = 5.0
 """Longest time for the end of the script and of the connection."""
