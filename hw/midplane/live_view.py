@@ -14,14 +14,13 @@ Two operators for :func:`hw.midplane.pattern_injection.pattern_injection`: a ter
 from __future__ import annotations
 
 from collections import deque
-from contextlib import AbstractContextManager
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from hw.midplane.pattern_injection import LONGEST, Decision, View, middle_of, sides_seen
 from hw.midplane.terminal_image import Screen
 from hw.runtime.interrupts import heed_interrupt
+from hw.runtime.keys import Keyboard
 from jaxcal import InputError
 
 _LEAST_STEP_MM, _LARGEST_STEP_MM = 0.02, 1.0
@@ -114,19 +113,6 @@ def profile(view: View, columns: int = _PROFILE_COLUMNS) -> tuple[str, str]:
     return f"{low:+6.1f} {drawn} {high:+.1f} mm", f"{'':7}{'':{here}}^"
 
 
-@runtime_checkable
-class KeySource(Protocol):
-    """Where keys come from (see :class:`hw.runtime.keys.Keyboard`)."""
-
-    def asking(self) -> AbstractContextManager[None]:
-        """Within it keys go to :meth:`read`; those pressed before are forgotten."""
-        ...
-
-    def read(self, timeout_s: float) -> str | None:
-        """The next key's name; None if none came in time."""
-        ...
-
-
 class TerminalOperator:
     """A person at a terminal.
 
@@ -136,7 +122,7 @@ class TerminalOperator:
         screen: where to show it.
     """
 
-    def __init__(self, keys: KeySource, screen: Screen) -> None:
+    def __init__(self, keys: Keyboard, screen: Screen) -> None:
         self._source, self._screen = keys, screen
         self._keys = Keys()
 

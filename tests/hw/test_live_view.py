@@ -30,6 +30,7 @@ from hw.midplane.pattern_injection import (
 from hw.midplane.terminal_image import Screen, picture
 from hw.planning.poses import plan_poses
 from hw.runtime.interrupts import as_interrupts
+from hw.runtime.keys import Keyboard
 from jaxcal import InputError
 
 
@@ -45,7 +46,7 @@ def sweep_then_middle():
     yield from ["m", "enter"]
 
 
-class Typed:
+class Typed(Keyboard):
     """Keys typed beforehand; None first, so that the view is painted again without one."""
 
     def __init__(self, keys: Iterable[str]) -> None:
