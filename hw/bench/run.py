@@ -115,6 +115,10 @@ class Bench:
         found = np.array(self._control.ask("truth", pose=pose.tolist()))
         return found.reshape(*pose.shape[:-2], 3)
 
+    def elevation_mm(self) -> float:
+        """The target's true elevational offset now, mm."""
+        return float(self.truth(self.true_pose())[2])
+
     def world_truth(self) -> dict[str, np.ndarray]:
         """``image_to_probe`` (4, 4), ``point_mm`` (3,), ``sound_speed_m_s``, ``latency_s``."""
         told = self._control.ask("world")
