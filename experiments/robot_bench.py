@@ -35,9 +35,9 @@ from hw.robot.identity import read_identity
 from hw.robot.limits import Limits
 from hw.robot.motion import Motion
 from hw.robot.motion_plan import MotionPlan
-from hw.robot.pose import ur_to_pose
 from hw.robot.stream import PoseStream
 from hw.runtime.errors import DeviceError
+from hw.runtime.rigid import ur_to_pose
 
 SEED = 7
 HOME = ur_to_pose(np.array(START))

@@ -24,10 +24,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from hw.bench.joints import LEAST_DEXTERITY_MM, JointTrack, first_joints, track
-from hw.bench.travel import Motion, Vector
+from hw.bench.joints import LEAST_DEXTERITY_MM, JointTrack, Motion, Vector, first_joints, track
 from hw.robot.kinematics import branch_of, dexterity_mm, flange_of, inverse, model_named
-from hw.robot.pose import ur_to_pose
+from hw.runtime.rigid import ur_to_pose
 
 _AHEAD_S = 0.01
 """Longest time between two checks of the arm by a controller; a CB-series one checks every 8 ms."""

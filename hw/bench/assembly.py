@@ -20,9 +20,8 @@ from hw.bench.robot import CB_SERIES, E_SERIES, RobotProcess, model_of
 from hw.bench.ultrasound import ImageServer
 from hw.bench.world import World, make_world
 from hw.planning.scene import Scene
-from hw.robot.pose import pose_to_ur, ur_to_pose
 from hw.runtime.clock import Clock
-from hw.runtime.rigid import looking_rotation
+from hw.runtime.rigid import looking_rotation, pose_to_ur, ur_to_pose
 from jaxcal import InputError
 from jaxcal.runtime.array_types import Float
 
@@ -39,6 +38,8 @@ _OF_THE_ROBOT: dict[str, tuple[str, ...]] = {
 }
 """Faults of the robot (:meth:`hw.bench.rtde.RtdeServer.act`), and the names of their values."""
 
+_IMAGE_HZ = 30.0
+"""Ultrasound frames per bench second."""
 _ADDRESS_TRIES = 8
 _HOVER_MM = 70.0
 
@@ -51,13 +52,9 @@ class BenchOptions:
         speed: bench seconds per wall second.
         seed: of the world, and of all chance.
         pose_hz: of the robot's stream in bench time, 125 or 500: which controller it is.
-        echo_hz: active-echo frames per bench second.
-        image_hz: ultrasound frames per bench second.
         most_images_wall_hz: cap on ultrasound frames per wall second.
         most_poses_wall_hz: cap on poses of the robot's stream per wall second.
         repeatability_mm: SD of the arm's hidden error on each axis.
-        robot_host: loopback address; empty: any free one.
-        link: of the active echo: ``pty`` or ``tcp``.
         phantom: in the tank, by name (:mod:`hw.bench.phantoms`).
         world: further changes of the world, by name (see :func:`hw.bench.world.make_world`).
     """
@@ -65,21 +62,15 @@ class BenchOptions:
     speed: float = 1.0
     seed: int = 0
     pose_hz: int = 125
-    echo_hz: float = 30.0
-    image_hz: float = 30.0
     most_images_wall_hz: float = 60.0
     most_poses_wall_hz: float = 1000.0
     repeatability_mm: float = 0.1
-    robot_host: str = ""
-    link: str = "pty"
     phantom: str = "active-echo"
     world: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name, least, largest in (
             ("speed", 0.01, 100.0),
-            ("echo_hz", 0.1, 1000.0),
-            ("image_hz", 0.1, 200.0),
             ("most_images_wall_hz", 0.1, 1000.0),
             ("most_poses_wall_hz", 50.0, 1000.0),
             ("repeatability_mm", 0.0, 10.0),
@@ -89,8 +80,6 @@ class BenchOptions:
                 raise InputError(f"bench: {name} must be {least:g} to {largest:g}, not {value}")
         if self.pose_hz not in VERSIONS:
             raise InputError(f"bench: pose_hz must be 125 or 500, not {self.pose_hz}")
-        if self.link not in ("pty", "tcp"):
-            raise InputError(f"bench: link must be pty or tcp, not {self.link!r}")
 
 
 class Assembly:
@@ -125,16 +114,14 @@ class Assembly:
         self.echo = AuspisEmulator(
             self._hear,
             clock=self.clock,
-            rate_hz=options.echo_hz,
             lines=self.world.probe.elements,
             clock_hz=self.world.clock_hz,
-            link="tcp" if options.link == "tcp" else "pty",
             seed=options.seed,
         )
         self.images = ImageServer(
             self._see,
             clock=self.clock,
-            rate_hz=min(options.image_hz, options.most_images_wall_hz / options.speed),
+            rate_hz=min(_IMAGE_HZ, options.most_images_wall_hz / options.speed),
             spacing_mm=self.camera.spacing_mm,
             seed=options.seed,
         )
@@ -207,17 +194,12 @@ class Assembly:
 
     def _start_robot(self) -> RobotProcess:
         chance = random.Random(os.getpid())
-        hosts = (
-            [self.options.robot_host]
-            if self.options.robot_host
-            else [
-                f"127.0.{chance.randrange(256)}.{chance.randrange(2, 255)}"
-                for _ in range(_ADDRESS_TRIES)
-            ]
-            + ["127.0.0.1"]
-        )
+        hosts = [
+            f"127.0.{chance.randrange(256)}.{chance.randrange(2, 255)}"
+            for _ in range(_ADDRESS_TRIES)
+        ]
         trouble: OSError | None = None
-        for host in hosts:
+        for host in [*hosts, "127.0.0.1"]:
             server = RobotProcess(
                 self.arm,
                 host,
@@ -229,7 +211,7 @@ class Assembly:
                 return server.start()
             except OSError as error:
                 trouble = error
-        raise InputError(f"bench: the robot's ports are taken at {hosts[-1]}: {trouble}")
+        raise InputError(f"bench: the robot's ports are taken at 127.0.0.1: {trouble}")
 
     def stop(self) -> None:
         """Stop every device; safe to repeat."""

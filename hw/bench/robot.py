@@ -21,8 +21,8 @@ from dataclasses import asdict
 from typing import Any
 
 from hw.bench.arm import Arm
+from hw.bench.joints import Motion
 from hw.bench.rtde import RtdeServer
-from hw.bench.travel import Motion
 from hw.runtime.clock import REAL, Clock
 from hw.runtime.processes import ANSWERS, be_prompt, finish, spawn
 

@@ -25,8 +25,8 @@ import numpy as np
 from hw.recording.check import check_resumable
 from hw.recording.file import utc_now
 from hw.recording.layout import TEXT_BYTES, RecordingHeader
-from hw.robot.pose import ur_to_pose
 from hw.runtime.processes import finish, spawn
+from hw.runtime.rigid import ur_to_pose
 from jaxcal import CalibrationError, FormatError, OutputError
 
 if TYPE_CHECKING:

@@ -22,12 +22,11 @@ from typing import IO, Any
 import numpy as np
 
 from hw.robot.identity import Identity, read_identity
-from hw.robot.pose import ur_to_pose
 from hw.robot.rtde import Packet, PendantSettings, too_late
 from hw.runtime.clock import REAL, Clock, Lag
 from hw.runtime.errors import DeviceError, LostError, StaleError, refused
 from hw.runtime.processes import spawn
-from hw.runtime.rigid import rotation_vector
+from hw.runtime.rigid import rotation_vector, ur_to_pose
 from jaxcal.runtime.array_types import Float
 
 _OFFSET_TOLERANCE = 1e-6

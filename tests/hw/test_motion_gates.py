@@ -33,10 +33,10 @@ from hw.robot.confirmation import confirm_unattended
 from hw.robot.identity import read_identity
 from hw.robot.motion import Motion
 from hw.robot.motion_plan import MotionPlan
-from hw.robot.pose import ur_to_pose
 from hw.robot.rtde import PacketReader, state_text
 from hw.runtime.clock import REAL
 from hw.runtime.errors import LostError, RefusedError, StaleError, StoppedError
+from hw.runtime.rigid import ur_to_pose
 
 pytest.importorskip("rtde_control", reason="ur_rtde has no wheel for this platform")
 

@@ -17,8 +17,8 @@ from hw.bench.controller import DONE, READY, Controller
 from hw.bench.robot import RobotProcess
 from hw.bench.rtde import RtdeServer
 from hw.bench.rtde_fields import output_type
-from hw.robot.pose import pose_to_ur, ur_to_pose
 from hw.runtime.clock import Clock
+from hw.runtime.rigid import pose_to_ur, ur_to_pose
 
 rtde_receive = pytest.importorskip("rtde_receive", reason="no wheel of ur_rtde here")
 rtde_control = pytest.importorskip("rtde_control", reason="no wheel of ur_rtde here")

@@ -20,11 +20,11 @@ from robots import CB_SERIES, E_SERIES, START, EmulatedRobot, address
 from hw.bench.arm import Arm
 from hw.bench.rtde import RtdeServer
 from hw.robot.identity import read_identity
-from hw.robot.pose import ur_to_pose
 from hw.robot.rtde import PacketReader, PendantSettings, safety_text
 from hw.robot.stream import PoseSample, PoseStream, average
 from hw.runtime.clock import Clock, Lag
 from hw.runtime.errors import LostError, RefusedError, StaleError
+from hw.runtime.rigid import ur_to_pose
 
 
 @pytest.mark.parametrize("seconds", [1.5, pytest.param(60.0, marks=pytest.mark.slow)])

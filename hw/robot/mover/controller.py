@@ -17,9 +17,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from hw.robot.mover.inputs import Inputs, lost
+from hw.robot.mover.inputs import Ended, Inputs, lost
 from hw.robot.mover.messages import Caller, Setup
-from hw.robot.mover.stop_latch import Ended
 from hw.robot.rtde import PROGRAM_RUNS, Packet, safety_text, state_text
 from hw.runtime.errors import DeviceError, LostError, StoppedError
 from hw.runtime.processes import ASKS, be_prompt
