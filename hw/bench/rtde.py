@@ -52,6 +52,8 @@ DASHBOARD, PRIMARY, SCRIPT, RTDE = DASHBOARD_PORT, PRIMARY_PORT, 30003, 30004
 _MAX_WAITING = 1 << 16
 """Bytes that may wait for a client that does not read; further packets for it are dropped."""
 _ROBOT_MESSAGE = 20
+_CLOCK_AHEAD_S = 1000.0
+"""The controller's time less bench time."""
 _LATE_S = 1.0
 _HELD_S = 0.01
 """Bench time after which this process counts as held up by the machine."""
@@ -79,12 +81,9 @@ class RtdeServer:
         arm: what moves.
         host: 127.0.0.x.
         version: (major, minor, bugfix, build) of the controller.
-        clock: bench time; the controller's own time is this plus an offset and a drift.
-        frequency_hz: packets per bench second; by default 500 from version 5 on, else 125.
+        clock: bench time; the controller's own time is a thousand seconds ahead.
         max_rate_hz: packets per wall second, whatever the clock's speed asks for.
         serial: what the dashboard says; the arm's kinematic calibration is drawn from it.
-        offset_s: controller time at bench time zero.
-        drift_ppm: of the controller's time against bench time.
     """
 
     def __init__(
@@ -94,15 +93,12 @@ class RtdeServer:
         *,
         version: tuple[int, int, int, int] = (5, 11, 0, 108249),
         clock: Clock = REAL,
-        frequency_hz: float | None = None,
         max_rate_hz: float = 1000.0,
         serial: str = "20195500042",
-        offset_s: float = 1000.0,
-        drift_ppm: float = 0.0,
     ) -> None:
         self.arm, self.host, self.version, self.clock = arm, host, version, clock
         self.serial = serial
-        nominal = frequency_hz or (500.0 if version[0] >= 5 else 125.0)
+        nominal = 500.0 if version[0] >= 5 else 125.0
         self.frequency_hz = min(nominal, max_rate_hz / clock.speed)
         self.controller = Controller(arm, told=self._say_why)
         self.asked: list[str] = []
@@ -112,7 +108,6 @@ class RtdeServer:
         self.skipped = 0
         self.late = 0
         """Packets never made because this process was held up for more than a second."""
-        self._offset, self._rate = offset_s, 1.0 + drift_ppm * 1e-6
         self._selector = selectors.SelectSelector()
         self._connections: set[_Connection] = set()
         self._listeners: list[socket.socket] = []
@@ -397,7 +392,7 @@ class RtdeServer:
         program, arm = self.controller, self.arm
         raw, velocity = arm.raw(t), arm.velocity(t)
         values: dict[str, tuple[float, ...] | float | int] = {
-            "timestamp": self._offset + self._rate * t,
+            "timestamp": _CLOCK_AHEAD_S + t,
             "actual_TCP_pose": raw,
             "target_TCP_pose": raw,
             "actual_TCP_speed": velocity,

@@ -100,16 +100,24 @@ def advice(view: View) -> str:
     return "The bar has shrunk on both sides: m moves the robot to the middle."
 
 
-def profile(view: View, columns: int = _PROFILE_COLUMNS) -> tuple[str, str]:
+def profile(view: View) -> tuple[str, str]:
     """The longest bar seen in each stretch of offsets, drawn as columns, and a pointer below it."""
     places = np.array([place for place, _ in view.seen])
     low, high = min(places.min(), -2.0), max(places.max(), 2.0)
-    at = np.clip(((places - low) / (high - low) * (columns - 1)).round().astype(int), 0, None)
-    heights = np.zeros(columns, int)
+    at = np.clip(
+        ((places - low) / (high - low) * (_PROFILE_COLUMNS - 1)).round().astype(int), 0, None
+    )
+    heights = np.zeros(_PROFILE_COLUMNS, int)
     np.maximum.at(heights, at, np.array([length for _, length in view.seen]))
     steps = np.ceil(heights / LONGEST * (len(_PROFILE) - 1)).astype(int)
     drawn = "".join(_PROFILE[step] for step in steps)
-    here = int(np.clip(round((view.offset_mm - low) / (high - low) * (columns - 1)), 0, columns))
+    here = int(
+        np.clip(
+            round((view.offset_mm - low) / (high - low) * (_PROFILE_COLUMNS - 1)),
+            0,
+            _PROFILE_COLUMNS,
+        )
+    )
     return f"{low:+6.1f} {drawn} {high:+.1f} mm", f"{'':7}{'':{here}}^"
 
 
@@ -158,13 +166,12 @@ class WindowOperator:
 
     Args:
         figure: a matplotlib figure with a canvas that takes keys; by default a new window.
-        spacing_mm: [lateral, axial] of the frames, mm per px.
 
     Raises:
         InputError: matplotlib has no display.
     """
 
-    def __init__(self, figure=None, spacing_mm: tuple[float, float] | None = None) -> None:
+    def __init__(self, figure=None) -> None:
         if figure is None:
             import matplotlib.pyplot as plt
 
@@ -176,7 +183,6 @@ class WindowOperator:
         self._image_axes, self._axes = figure.subplots(1, 2, width_ratios=(3, 2))
         self._image_axes.set(title="B-mode", xticks=[], yticks=[])
         self._axes.set(xlabel="probe's offset (mm)", ylabel="bar (lines)", ylim=(0, LONGEST + 1))
-        self._aspect = 1.0 if spacing_mm is None else spacing_mm[1] / spacing_mm[0]
         self._picture = None
         (self._line,) = self._axes.plot([], [], "o", color="0.6")
         (self._here,) = self._axes.plot([], [], "o", color="tab:red", markersize=10)
@@ -216,7 +222,7 @@ class WindowOperator:
         if frame is not None:
             if self._picture is None:
                 self._picture = self._image_axes.imshow(
-                    frame, cmap="gray", vmin=0, vmax=255, aspect=self._aspect
+                    frame, cmap="gray", vmin=0, vmax=255, aspect=1.0
                 )
             else:
                 self._picture.set_data(frame)

@@ -144,9 +144,9 @@ def test_a_block_is_painted_over_itself_and_lines_stay(monkeypatch):
 def test_a_person_before_a_window_finds_the_mid_plane():
     bench = stage()
     camera, rng = Camera(bench.world), np.random.default_rng(1)
-    figure = Figure()
+    figure = Figure(dpi=30)
     canvas = FigureCanvasAgg(figure)
-    window = WindowOperator(figure, camera.spacing_mm)
+    window = WindowOperator(figure)
     keys = iter(sweep_then_middle())
 
     def press(key: str) -> None:
