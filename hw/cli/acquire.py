@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable
 from contextlib import ExitStack
 from datetime import datetime
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -160,11 +161,12 @@ def acquire(
                 click.echo(line)
             return ExitCode.CONVERGED
         if preview is not None:
-            from hw.acquisition.dry_run import draw
+            from hw.acquisition.request import planned
+            from hw.planning.poses import preview as draw
 
             if resume:
                 raise InputError("--preview draws a new plan; it cannot be used with --resume")
-            draw(setup, request, preview)
+            draw(planned(setup, request), Path(preview))
         new = None if resume else request
         return _acquire(setup, path, new, emulated, unattended, operator, view)
 
