@@ -15,7 +15,7 @@ import numpy as np
 from common import save_figure
 
 from hw.bench.frames import DEPTH_MM, Camera
-from hw.bench.look import Look
+from hw.bench.tank import Look
 from hw.bench.world import World, make_world
 from hw.runtime.choices import PHANTOMS
 from jaxcal.data.poses import rotations_from_vectors

@@ -32,7 +32,7 @@ from common import arguments, machine, save_figure, write_table
 
 from hw.bench.stage import Pace, WorldStage
 from hw.bench.world import World, make_world
-from hw.midplane.amplitude_scan import amplitude_scan, free_hand
+from hw.midplane.amplitude_scan import amplitude_scan, fit_peak
 from hw.midplane.bracket import Bracket
 from hw.midplane.pattern_injection import SteadyOperator, pattern_injection
 from hw.midplane.search import PlacementError, Settings, first_seen
@@ -127,9 +127,14 @@ def by_hand_swept(world: World, pose: np.ndarray, rng: np.random.Generator) -> I
             echoes.append(world.echo(true, settings.low_threshold, rng))
         top = [float(np.sort(amplitude)[-8:].mean()) for _, amplitude in echoes]
         try:
-            best, bracket = free_hand(np.array(places), np.array(top), settings)
+            peak = fit_peak(np.array(places), np.array(top), settings.full_scale)
         except PlacementError:
             continue
+        # The loudest frame, as in the paper; if that is saturated, the one nearest to the maximum.
+        best = int(np.argmax(top))
+        if top[best] >= 0.98 * settings.full_scale:
+            best = int(np.argmin(np.abs(np.array(places) - peak.place_mm)))
+        bracket = peak.bracket(places[best], settings)
         true, tracked = poses[best]
         offset = world.truth(true).elevation_mm
         return Image(tracked, echoes[best][0], bracket, offset, seconds)

@@ -5,8 +5,7 @@ through ur_rtde. Three tables:
 
 - ``robot_faults.csv``: for every fault during a motion at 50 mm/s, how long (ms) until the arm
   rests and until the caller knows, by the emulator's own clock. The bar is 200 ms.
-- ``robot_rates.csv``: poses lost at 125 and 500 Hz, both robots at once, read packet by packet
-  and through ur_rtde's receive interface.
+- ``robot_rates.csv``: poses lost at 125 and 500 Hz, both robots at once.
 - ``robot_speeds.csv``: how much faster than real time the bench may run before the freshness limit
   (100 ms of bench time), the controller's watchdog (100 ms) or the caller's limit stop motions.
 
@@ -36,9 +35,9 @@ from hw.robot.identity import read_identity
 from hw.robot.limits import Limits
 from hw.robot.motion import Motion
 from hw.robot.motion_plan import MotionPlan
-from hw.robot.pose import ur_to_pose
 from hw.robot.stream import PoseStream
 from hw.runtime.errors import DeviceError
+from hw.runtime.rigid import ur_to_pose
 
 SEED = 7
 HOME = ur_to_pose(np.array(START))
@@ -57,7 +56,7 @@ LIMITS = Limits(
     search_deg=0.5,
 )
 FAULTS = (
-    "mute", "drop", "drop control", "protective_stop", "force", "set_tcp_offset", "guard", "stop",
+    "mute", "drop", "drop control", "protective_stop", "force", "tcp_offset", "guard", "stop",
     "kill the mover", "silent caller",
 )  # fmt: skip
 
@@ -112,7 +111,7 @@ def fault(name: str) -> tuple[float, float, str]:
             "stop": lambda: motion.stop("the operator pressed stop"),
             "kill the mover": lambda: os.kill(mover, signal.SIGKILL),
             "force": lambda: robot.ask("force", [0.0, 0.0, -40.0, 0.0, 0.0, 0.0]),
-            "set_tcp_offset": lambda: robot.ask(name, [0.0, 0.0, 0.2, 0.0, 0.0, 0.0]),
+            "tcp_offset": lambda: robot.ask(name, [0.0, 0.0, 0.2, 0.0, 0.0, 0.0]),
         }
         with ThreadPoolExecutor(1) as pool:
             future = pool.submit(motion.move_to, PLAN.targets[1])
@@ -145,29 +144,27 @@ def faults(repeats: int) -> list[list[object]]:
 
 
 def rates(seconds: float) -> list[list[object]]:
-    """A row for each robot and client, all four at once."""
+    """A row for each robot, both at once."""
     with (
         EmulatedRobot("127.0.9.2", version=E_SERIES) as fast,
         EmulatedRobot("127.0.9.3", version=CB_SERIES) as slow,
     ):
         streams = [
-            (robot, PoseStream(robot.host, clock=robot.clock, client=client).start(), hz, client)
+            (robot, PoseStream(robot.host, clock=robot.clock).start(), hz)
             for robot, hz in ((fast, 500.0), (slow, 125.0))
-            for client in ("packets", "ur_rtde")
         ]
         time.sleep(seconds)
         rows: list[list[object]] = []
-        for robot, stream, hz, client in streams:
+        for robot, stream, hz in streams:
             samples = stream.drain()
             stream.close()
             span = samples[-1].t_device - samples[0].t_device
             expected = round(span * hz) + 1
             lag = max(sample.lag_s for sample in samples)
             unsent = robot.state()["late"] + robot.state()["skipped"]
-            rows.append([hz, client, span, expected, len(samples), expected - len(samples),
+            rows.append([hz, span, expected, len(samples), expected - len(samples),
                          stream.dropped, unsent, 1000 * lag])  # fmt: skip
-            print(f"{hz:g} Hz by {client}: {expected - len(samples)} of {expected} lost",
-                  flush=True)  # fmt: skip
+            print(f"{hz:g} Hz: {expected - len(samples)} of {expected} lost", flush=True)
     return rows
 
 
@@ -220,8 +217,7 @@ def main() -> None:
     )  # fmt: skip
     write_table(
         folder / f"robot_rates{end}.csv",
-        ["rate_hz", "client", "seconds", "sent", "received", "lost", "dropped", "not_sent",
-         "largest_lag_ms"],
+        ["rate_hz", "seconds", "sent", "received", "lost", "dropped", "not_sent", "largest_lag_ms"],
         rates(3.0 if quick else 60.0),
     )  # fmt: skip
     speed_rows = speeds(12 if quick else 60)

@@ -40,16 +40,16 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
+from hw.bench.joints import Motion as ArmMotion
 from hw.bench.robot import CB_SERIES, E_SERIES, START, EmulatedRobot
-from hw.bench.travel import Motion as ArmMotion
 from hw.robot.confirmation import confirm_unattended
 from hw.robot.identity import read_identity
 from hw.robot.limits import Limits
 from hw.robot.motion import Motion
 from hw.robot.motion_plan import MotionPlan
-from hw.robot.pose import ur_to_pose
 from hw.runtime.clock import Clock
 from hw.runtime.errors import DeviceError
+from hw.runtime.rigid import ur_to_pose
 from jaxcal.runtime.isolated import import_path
 
 SEED = 16
@@ -220,9 +220,8 @@ def _lines_into(told: queue.SimpleQueue[str], stream: Iterable[str] | None) -> N
 def caller(task: dict) -> None:
     """What one trial's process does; two lines of JSON on standard output."""
     clock = Clock(1.0, task["origin_s"])
-    plan = MotionPlan.from_poses(
-        task["targets"], Limits.from_mapping(task["limits"]), task["tcp_offset"], task["serial"]
-    )
+    limits, offset = Limits.from_mapping(task["limits"]), tuple(task["tcp_offset"])
+    plan = MotionPlan(np.array(task["targets"]), limits, offset, task["serial"])
     request_s, stop_s = math.inf, math.inf
 
     def guard() -> str | None:

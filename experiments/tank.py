@@ -18,9 +18,8 @@ from functools import lru_cache
 import numpy as np
 from jaxtyping import Float
 
-from hw.bench.look import Look
-from hw.bench.phantoms.cross_wire import SCATTER_MM, WIRE_MM
-from hw.bench.tank import ELEMENT_MM, Beam, Noise
+from hw.bench.phantoms import SCATTER_MM, WIRE_MM
+from hw.bench.tank import ELEMENT_MM, Beam, Look, Noise
 from hw.bench.world import DRAWN, TANK_MM
 from hw.planning.poses import Extent, plan_poses
 from hw.planning.scene import Scene
@@ -224,7 +223,7 @@ def element_sd_mm(tank: Tank) -> float:
 
 
 def echo_width_mm(tank: Tank) -> float:
-    """Lateral SD of the active echo's mark (hw/bench/phantoms/active_echo.py)."""
+    """Lateral SD of the active echo's mark (hw/bench/phantoms.pyactive_echo.py)."""
     return float(np.hypot(np.sqrt(2.0) * tank.look.lateral_mm, tank.element_mm / np.sqrt(12.0)))
 
 

@@ -23,9 +23,9 @@ from tank_grid import Grid
 from tank_run import SEED, Run
 
 from hw.bench.frames import Camera
-from hw.bench.look import Look
 from hw.bench.phantoms import CrossWire
 from hw.bench.stage import Pace, WorldStage
+from hw.bench.tank import Look
 from hw.bench.world import World, make_world
 from hw.midplane.amplitude_scan import amplitude_scan
 from hw.midplane.bracket import Bracket

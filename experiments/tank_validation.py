@@ -23,9 +23,9 @@ from tank_run import SEED, Run
 
 from hw.acquisition.stage import IMAGE_AGE_S
 from hw.bench.frames import COLUMNS, DECIBELS, Camera
-from hw.bench.look import Look
 from hw.bench.phantoms import ActiveEcho, CrossWire, Hydrophone
 from hw.bench.stage import WorldStage
+from hw.bench.tank import Look
 from hw.bench.world import World, make_world
 from hw.midplane.amplitude_scan import amplitude_scan
 from hw.midplane.image_scan import ImageBench, image_scan, pixel_of
@@ -233,7 +233,7 @@ def image_bench(stage: WorldStage, camera: Camera, rng: np.random.Generator) -> 
 
     expected = world.scene.expected(stage.plan_pose)[[0, 2]]
     place = pixel_of(expected, camera.spacing_mm, COLUMNS)
-    return ImageBench(stage, see, place, 120.0)
+    return ImageBench(stage.move, see, place, 120.0)
 
 
 def times(count: int) -> list[dict[str, Any]]:

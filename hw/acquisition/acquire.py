@@ -12,7 +12,7 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -55,6 +55,9 @@ from hw.view.feed import Audience, watched
 from jaxcal import CalibrationError
 from jaxcal.cli.common import ExitCode
 
+if TYPE_CHECKING:
+    from hw.bench.run import Bench
+
 _MOST_GIVEN_UP = 3
 _FURTHEST_START_MM = 3.0
 _IMAGES_FOR_PREDICTION = 8
@@ -76,23 +79,6 @@ class AcquisitionStopped(CalibrationError):
         super().__init__(message)
         self.by_itself = by_itself
         self.exit_code = ExitCode.INTERRUPTED if interrupted else ExitCode.STOPPED
-
-
-@runtime_checkable
-class Oracle(Protocol):
-    """What an emulated bench knows of the truth."""
-
-    def elevation_mm(self) -> float:
-        """The target's true elevational offset, now."""
-        ...
-
-    def truth(self) -> tuple[np.ndarray, np.ndarray]:
-        """The true X (4, 4) and target (3,), mm."""
-        ...
-
-    def test_set(self) -> tuple[np.ndarray, np.ndarray]:
-        """Noise-free test images: poses (n, 4, 4) and [lateral, range] (n, 2), mm."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -127,7 +113,7 @@ def acquire(
     confirm: Confirm,
     *,
     say: Callable[[str], None] = lambda line: None,
-    oracle: Oracle | None = None,
+    emulated: Bench | None = None,
     operator: Callable[[], Operator] = SteadyOperator,
     pause: Pause | None = None,
     watch: Watch | None = None,
@@ -141,7 +127,7 @@ def acquire(
         request: what to acquire; None resumes the recording at ``path``.
         confirm: asked once before anything moves, with the plan of motion; resuming asks again.
         say: told one line after every image, and of everything that a person should know.
-        oracle: of an emulated bench; its truth goes into the recording.
+        emulated: the bench, if it is emulated; its truth goes into the recording.
         operator: called for every pose; makes the operator that follows the injected pattern.
         pause: to hold the run between images.
         watch: limits of the devices' silence.
@@ -167,7 +153,7 @@ def acquire(
         with _closing(recorder):
             try:
                 run = _Run(
-                    job, recorder, estimator, say, oracle, operator, pause, view or Audience()
+                    job, recorder, estimator, say, emulated, operator, pause, view or Audience()
                 )
                 return run.outcome(confirm, watch)
             except KeyboardInterrupt:
@@ -181,8 +167,8 @@ def acquire(
                 recorder.add_event("stopped", reason, setup.clock.now())
                 if job.progress is not None and job.progress.ended:
                     # It was complete before this run, and stays so.
-                    if oracle is not None:
-                        _write_truth(recorder, oracle)
+                    if emulated is not None:
+                        _write_truth(recorder, emulated)
                     _finish(recorder, job.images - estimator.count)
     except KeyboardInterrupt:
         # Ctrl-C once more, while everything was being closed: the pipe's end stops the robot.
@@ -226,7 +212,7 @@ class _Run:
     recorder: Recorder
     estimator: Estimator
     say: Callable[[str], None]
-    oracle: Oracle | None
+    emulated: Bench | None
     operator: Callable[[], Operator]
     pause: Pause | None
     view: Audience
@@ -250,8 +236,8 @@ class _Run:
             motion = self._confirmed(session, confirm)
             with motion:
                 self._take_images(session, ProbeStage(session, motion, job.targets, self._note))
-        if self.oracle is not None:
-            _write_truth(recorder, self.oracle)
+        if self.emulated is not None:
+            _write_truth(recorder, self.emulated)
         self._note("finished", f"{estimator.count} images")
         without = tuple(sorted(self.without))
         # A pool has other poses for those without an image.
@@ -407,7 +393,7 @@ class _Run:
 
     def _select(self, row: int, placement: Placement, shot: _Shot, began: float) -> None:
         """Put the image among those of the calibration, and solve again."""
-        clock, bracket, oracle = self.clock, placement.bracket, self.oracle
+        clock, bracket, emulated = self.clock, placement.bracket, self.emulated
         self.recorder.add_selected(
             shot.pose,
             shot.measurement,
@@ -418,7 +404,7 @@ class _Run:
             target=row,
             bracket=(bracket.centre_mm, bracket.low_mm, bracket.high_mm, bracket.sd_mm),
             offset=placement.offset_mm,
-            true_elevation=float("nan") if oracle is None else oracle.elevation_mm(),
+            true_elevation=float("nan") if emulated is None else emulated.elevation_mm(),
             seconds=clock.now() - began,
         )
         estimate = self.estimator.add(shot.pose, shot.measurement, bracket.max_elevation_mm)
@@ -432,12 +418,12 @@ def _finish(recorder: Recorder, without_image: int) -> str:
     return recorder.finish()
 
 
-def _write_truth(recorder: Recorder, oracle: Oracle) -> None:
+def _write_truth(recorder: Recorder, emulated: Bench) -> None:
     recorder.sync()
-    transform, point = oracle.truth()
-    poses, points = oracle.test_set()
-    recorder.put("truth", "image_to_probe", transform, "mm")
-    recorder.put("truth", "point", point, "mm")
+    world = emulated.world_truth()
+    poses, points = emulated.test_set()
+    recorder.put("truth", "image_to_probe", world["image_to_probe"], "mm")
+    recorder.put("truth", "point", world["point_mm"], "mm")
     recorder.put("test", "pose", poses, "mm")
     recorder.put("test", "point", points, "mm")
     recorder.copy("placement", "true_elevation", "truth", "elevation")

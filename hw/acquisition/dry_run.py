@@ -63,8 +63,3 @@ def _dry_limits(setup: Setup) -> Limits:
     """The limits, without the arm's model where the setup lacks the controller's TCP offset."""
     limits = setup.motion_limits()
     return limits if setup.tcp_offset is not None else replace(limits, arm_model="")
-
-
-def draw(setup: Setup, request: AcquisitionRequest, figure: str) -> None:
-    """Write the plan's figure."""
-    preview(planned(setup, request), Path(figure))

@@ -163,7 +163,9 @@ class ProbeStage:
             credible: respond only where the segmentation finds the target.
         """
         place, within = self._expected_px(row, self.whole_frame())
-        return ImageBench(self, lambda: self.whole_frame().array, place, within, credible=credible)
+        return ImageBench(
+            self.move, lambda: self.whole_frame().array, place, within, credible=credible
+        )
 
     def _expected_px(self, row: int, image: Image) -> tuple[tuple[float, float], float]:
         """Where the target should be in an image, and how far from there to look, px."""

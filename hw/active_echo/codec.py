@@ -116,25 +116,6 @@ class Mode(Enum):
     """Whether the device streams is not known; the first line or frame with a right CRC tells."""
 
 
-@dataclass
-class DecoderCounts:
-    """What a decoder has seen.
-
-    Attributes:
-        frames: echo frames accepted.
-        replies: replies accepted.
-        crc_errors: frames or lines whose CRC was wrong.
-        malformed: chunks that were not COBS, of impossible length, or of an unknown kind.
-        resynchronised: how often something was accepted after something damaged.
-    """
-
-    frames: int = 0
-    replies: int = 0
-    crc_errors: int = 0
-    malformed: int = 0
-    resynchronised: int = 0
-
-
 def encode_line(text: str) -> bytes:
     """A command or a reply as a line with its CRC.
 
@@ -184,6 +165,11 @@ class Decoder:
 
     Args:
         mode: how the first bytes are read.
+
+    Attributes:
+        damaged: chunks with a wrong CRC, that were not COBS, of impossible length, or of an unknown
+            kind.
+        resynchronised: how often something was accepted after something damaged.
     """
 
     def __init__(self, mode: Mode = Mode.BINARY) -> None:
@@ -192,15 +178,15 @@ class Decoder:
         self._buffer = bytearray()
         self._scanned = 0
         self._skipping = False
-        self._damaged = False
-        self.counts = DecoderCounts()
+        self._after_damage = False
+        self.damaged = self.resynchronised = 0
         self.mode = mode
 
     def reset(self, mode: Mode) -> None:
         """Forget what is half read and read what comes in ``mode``; the counts go on."""
         self._buffer.clear()
         self._scanned = 0
-        self._skipping = self._damaged = False
+        self._skipping = self._after_damage = False
         self.mode = mode
 
     def feed(self, data: bytes) -> list[EchoPacket | Reply]:
@@ -239,19 +225,15 @@ class Decoder:
             return None, True
         if not chunk:
             return None, True
-        if len(chunk) > longest:
-            self.counts.malformed += 1
-            self._damaged = True
-            return None, True
-        return take(chunk), True
+        return (self._bad() if len(chunk) > longest else take(chunk)), True
 
     def _skip(self) -> None:
         """Drop a chunk that is too long, up to the next delimiter."""
         if not self._skipping:
-            self.counts.malformed += 1
+            self._bad()
         self._buffer.clear()
         self._scanned = 0
-        self._skipping = self._damaged = True
+        self._skipping = True
 
     def _next_unknown(self) -> tuple[EchoPacket | Reply | None, bool]:
         zero, feed = (self._buffer.find(mark, self._scanned) for mark in (b"\0", b"\n"))
@@ -268,8 +250,7 @@ class Decoder:
             self._scanned = feed + 1
             if not checked:
                 if checked is False:
-                    self.counts.crc_errors += 1
-                    self._damaged = True
+                    self._bad()
                 return None, True
             del self._buffer[: feed + 1]
             self._scanned = 0
@@ -285,39 +266,25 @@ class Decoder:
 
     def _line(self, line: bytes) -> Reply | None:
         text, checked = decode_line(line)
-        if checked:
-            return self._accept_reply(text)
-        self._damaged = True
-        if checked is None:
-            self.counts.malformed += 1
-        else:
-            self.counts.crc_errors += 1
-        return None
+        return self._accept_reply(text) if checked else self._bad()
 
     def _frame(self, chunk: bytes) -> EchoPacket | Reply | None:
         try:
             payload = self._unstuff(chunk)
         except self._error:
             payload = b""
-        if not 6 <= len(payload) <= _LONGEST:
-            self.counts.malformed += 1
-            self._damaged = True
-            return None
         body = payload[:-4]
-        if zlib.crc32(body) != int.from_bytes(payload[-4:], "little"):
-            self.counts.crc_errors += 1
-            self._damaged = True
-            return None
+        if not 6 <= len(payload) <= _LONGEST or (
+            zlib.crc32(body) != int.from_bytes(payload[-4:], "little")
+        ):
+            return self._bad()
         item = self._echo(body) if body[0] == _ECHO else None
         if item is not None:
-            self.counts.frames += 1
             self._good()
             return item
         if body[0] == _REPLY and body[1] == _VERSION:
             return self._accept_reply(body[2:].decode("ascii", "replace"))
-        self.counts.malformed += 1
-        self._damaged = True
-        return None
+        return self._bad()
 
     def _echo(self, body: bytes) -> EchoPacket | None:
         if len(body) < _HEADER.size:
@@ -330,14 +297,17 @@ class Decoder:
         return EchoPacket(frame, ticks, threshold, tof, amplitude)
 
     def _accept_reply(self, text: str) -> Reply:
-        self.counts.replies += 1
         self._good()
         word, _, value = text.partition(" ")
         if word == "STRM":
             self.mode = {"ON": Mode.BINARY, "OFF": Mode.TEXT}.get(value, self.mode)
         return Reply(word, value)
 
+    def _bad(self) -> None:
+        self.damaged += 1
+        self._after_damage = True
+
     def _good(self) -> None:
-        if self._damaged:
-            self.counts.resynchronised += 1
-            self._damaged = False
+        if self._after_damage:
+            self.resynchronised += 1
+            self._after_damage = False

@@ -28,7 +28,6 @@ from hw.active_echo.codec import (
     MAXIMUM_THRESHOLD,
     NO_RESPONSE,
     Decoder,
-    DecoderCounts,
     EchoPacket,
     Mode,
     Reply,
@@ -37,7 +36,7 @@ from hw.active_echo.codec import (
 from hw.active_echo.transport import BAUD, DEVICE, open_transport
 from hw.runtime.clock import REAL, Clock
 from hw.runtime.errors import DeviceError, LostError, RefusedError, StaleError
-from jaxcal.runtime.array_types import Float, UInt16
+from jaxcal.runtime.array_types import Float
 
 COMMAND_TIMEOUT_S = 1.0
 """A command that is not answered within this bench time has failed."""
@@ -53,28 +52,18 @@ _ANCHOR_S = 60.0
 _MAXIMUM_DELAY_TICKS = 0xFFFF
 
 
-@dataclass(frozen=True)
-class EchoFrame:
+@dataclass(frozen=True, kw_only=True)
+class EchoFrame(EchoPacket):
     """What the element heard of one frame of the ultrasound machine.
 
     Attributes:
         t_host: arrival of the frame's last byte, s of the bench's clock.
-        frame: the device's count of frame triggers.
-        ticks: the device's clock at the frame trigger.
-        threshold: in force during the frame, counts.
         tof_s: (lines,) one-way time of flight, s; NaN where nothing was heard.
-        tof_ticks: (lines,) the same as it came, 0xFFFF where nothing was heard.
-        amplitude: (lines,) peak amplitude, counts.
         late_s: upper bound of the time from its trigger to its arrival, s; NaN where not known.
     """
 
     t_host: float
-    frame: int
-    ticks: int
-    threshold: int
     tof_s: Float[np.ndarray, " lines"]
-    tof_ticks: UInt16[np.ndarray, " lines"]
-    amplitude: UInt16[np.ndarray, " lines"]
     late_s: float = float("nan")
 
 
@@ -157,7 +146,8 @@ class ActiveEcho:
         self._tick_s = 1.0 / self.clock_hz()
         with self._changed:
             self._frames.clear()
-            self._decoder.counts, self._counts = DecoderCounts(), EchoStatistics()
+            self._decoder.damaged = self._decoder.resynchronised = 0
+            self._counts = EchoStatistics()
             self._last_frame = None
             self._recent.clear()
 
@@ -294,11 +284,11 @@ class ActiveEcho:
     def statistics(self) -> EchoStatistics:
         """Counts since the port was opened."""
         with self._changed:
-            counts = self._decoder.counts
+            decoder = self._decoder
             return replace(
                 self._counts,
-                crc_errors=counts.crc_errors + counts.malformed,
-                resynchronised=counts.resynchronised,
+                crc_errors=decoder.damaged,
+                resynchronised=decoder.resynchronised,
             )
 
     def close(self) -> None:
@@ -424,16 +414,7 @@ class ActiveEcho:
         silent = packet.tof_ticks == NO_RESPONSE
         seconds = np.where(silent, np.nan, packet.tof_ticks * self._tick_s)
         self._frames.append(
-            EchoFrame(
-                t_host=now,
-                frame=packet.frame,
-                ticks=packet.ticks,
-                threshold=packet.threshold,
-                tof_s=seconds,
-                tof_ticks=packet.tof_ticks,
-                amplitude=packet.amplitude,
-                late_s=self._late(packet, now),
-            )
+            EchoFrame(**vars(packet), t_host=now, tof_s=seconds, late_s=self._late(packet, now))
         )
 
     def _late(self, packet: EchoPacket, now: float) -> float:

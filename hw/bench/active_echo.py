@@ -36,7 +36,6 @@ from hw.runtime.clock import REAL, Clock
 Echo = Callable[[float, int], tuple[np.ndarray, np.ndarray]]
 """(time s, threshold) -> time of flight (lines,) s with NaN for no response, amplitude (lines,)."""
 
-_DIGITS = frozenset(hexdigits)
 _LARGEST_SLIP_S = 0.25
 _LONGEST_COMMAND = 2 * MAXIMUM_LINES + 64
 
@@ -57,9 +56,20 @@ class Injection:
 
 
 @dataclass(frozen=True)
-class _Faults:
+class EchoFaults:
+    """Faults that benches have.
+
+    Attributes:
+        crc_errors: share of the frames in which a bit is flipped.
+        missed_triggers: share of the frame triggers that are missed: the counter goes on, the frame
+            does not come.
+        missed_lines: share of the frames in which a line trigger is missed.
+        stale: no frame triggers: commands are answered, frames do not come.
+        mute: nothing is said at all, port open.
+    """
+
     crc_errors: float = 0.0
-    missed_frames: float = 0.0
+    missed_triggers: float = 0.0
     missed_lines: float = 0.0
     stale: bool = False
     mute: bool = False
@@ -108,7 +118,7 @@ class AuspisEmulator:
             self._link = TcpLink()
         self._inbox = bytearray()
         self._errors: deque[str] = deque(maxlen=16)
-        self._faults = _Faults()
+        self._faults = EchoFaults()
         self._threshold = 0
         self._streaming = False
         self._first_frame = first_frame
@@ -151,25 +161,9 @@ class AuspisEmulator:
 
     # Faults
 
-    def crc_errors(self, rate: float) -> None:
-        """Flip a bit in this share of the frames."""
-        self._faults = replace(self._faults, crc_errors=rate)
-
-    def miss_triggers(self, rate: float) -> None:
-        """Miss this share of the frame triggers: the counter goes on, the frame does not come."""
-        self._faults = replace(self._faults, missed_frames=rate)
-
-    def miss_lines(self, rate: float) -> None:
-        """Miss a line trigger in this share of the frames."""
-        self._faults = replace(self._faults, missed_lines=rate)
-
-    def stale(self, on: bool = True) -> None:
-        """Get no frame triggers: commands are answered, frames do not come."""
-        self._faults = replace(self._faults, stale=on)
-
-    def mute(self, on: bool = True) -> None:
-        """Say nothing at all, port open."""
-        self._faults = replace(self._faults, mute=on)
+    def fault(self, **changes: float | bool) -> None:
+        """Begin or end some faults: attributes of :class:`EchoFaults`, by name."""
+        self._faults = replace(self._faults, **changes)
 
     def restart_counter(self) -> None:
         """Count frame triggers from zero again."""
@@ -188,7 +182,7 @@ class AuspisEmulator:
         else:
             host, port = self.path.removeprefix("socket://").split(":")
             self._link = TcpLink(host, int(port))
-        self._faults, self.injection = _Faults(), Injection()
+        self._faults, self.injection = EchoFaults(), Injection()
         self._threshold, self._streaming = 0, False
         self._frames, self._line_triggers = self._first_frame, 0
         self._inbox.clear()
@@ -198,7 +192,7 @@ class AuspisEmulator:
 
     def recover(self) -> None:
         """End all faults, except that an unplugged port stays unplugged."""
-        self._faults = _Faults()
+        self._faults = EchoFaults()
 
     # The device
 
@@ -237,7 +231,7 @@ class AuspisEmulator:
         self._frames += 1
         lines = self._lines - (self._random.random() < faults.missed_lines)
         self._line_triggers += lines
-        if not self._streaming or faults.mute or self._random.random() < faults.missed_frames:
+        if not self._streaming or faults.mute or self._random.random() < faults.missed_triggers:
             return
         seconds, amplitude = self._echo(t, self._threshold)
         packet = EchoPacket(

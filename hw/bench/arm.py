@@ -9,7 +9,7 @@ the tool is: the path of a motion is that of the TCP at its start.
 
 The tool reaches a commanded pose only to within the arm's repeatability: :meth:`Arm.raw` is the
 pose by the joint encoders, :meth:`Arm.true_raw` is where the tool is. The difference is redrawn
-with travel (its correlation falls as exp(-travel / ``correlation_mm``)), because a fine step hardly
+with travel (its correlation falls as exp(-travel / 20 mm)), because a fine step hardly
 changes the gears' error while a long move changes all of it.
 
 With a model the arm has joints (:mod:`hw.bench.joints`), and places where it cannot follow.
@@ -24,11 +24,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from hw.bench.joints import LEAST_DEXTERITY_MM, JointTrack, first_joints, track
-from hw.bench.travel import Motion, Vector
+from hw.bench.joints import LEAST_DEXTERITY_MM, JointTrack, Motion, Vector, first_joints, track
 from hw.robot.kinematics import branch_of, dexterity_mm, flange_of, inverse, model_named
-from hw.robot.pose import ur_to_pose
+from hw.runtime.rigid import ur_to_pose
 
+_CORRELATION_M = 0.02
+"""Travel over which the error of the tool is forgotten."""
+_HALT_M_S2 = 2.0
+"""Of a protective stop, and of a program that is stopped."""
+_REACH_M = (0.15, 0.85)
+"""Distance of the tool from the base that counts as safe, where the arm has no model."""
 _AHEAD_S = 0.01
 """Longest time between two checks of the arm by a controller; a CB-series one checks every 8 ms."""
 
@@ -41,11 +46,7 @@ class Arm:
         tcp_offset: the real tool's centre point in the flange's frame, m and rotation vector rad.
         repeatability_mm: SD of the tool's position error per axis.
         repeatability_deg: SD of its orientation error per axis.
-        correlation_mm: travel over which the error is forgotten.
         seed: of the errors.
-        halt_acceleration: m/s^2 of a protective stop, and of a program that is stopped.
-        reach_m: smallest and largest distance of the tool from the base that counts as safe, where
-            the arm has no model.
         model: name of the arm whose joints these are (:data:`hw.robot.kinematics.MODELS`); None: a
             tool that moves without an arm, without joints and singularities.
     """
@@ -57,10 +58,7 @@ class Arm:
         tcp_offset: Sequence[float] = (0.0,) * 6,
         repeatability_mm: float = 0.0,
         repeatability_deg: float = 0.0,
-        correlation_mm: float = 20.0,
         seed: int = 0,
-        halt_acceleration: float = 2.0,
-        reach_m: tuple[float, float] = (0.15, 0.85),
         model: str | None = None,
     ) -> None:
         self.settings = {
@@ -68,22 +66,16 @@ class Arm:
             "tcp_offset": _six(tcp_offset),
             "repeatability_mm": repeatability_mm,
             "repeatability_deg": repeatability_deg,
-            "correlation_mm": correlation_mm,
             "seed": seed,
-            "halt_acceleration": halt_acceleration,
-            "reach_m": tuple(reach_m),
             "model": model,
         }
         """The arguments, so that another process can make the same arm."""
         self.watcher: Callable[[Motion], None] | None = None
         """Told of every new motion, in the thread that commands it."""
         self._tool: Vector = _six(tcp_offset)
-        self.halt_acceleration = halt_acceleration
-        self.reach_m = reach_m
         self.force: Vector = (0.0,) * 6
         """Force and torque on the tool: N and N m."""
         self._sd = (repeatability_mm / 1000.0,) * 3 + (math.radians(repeatability_deg),) * 3
-        self._correlation = correlation_mm / 1000.0
         self._random = random.Random(seed)
         first = tuple(self._random.gauss(0.0, sd) for sd in self._sd)
         start = _six(raw)
@@ -144,7 +136,7 @@ class Arm:
         turn = _rotation_vector(_multiply(_quaternion(goal[3:]), _conjugate(quaternion)))
         distance = math.hypot(*travel)
         length = max(distance, math.hypot(*turn))
-        keep = math.exp(-distance / self._correlation)
+        keep = math.exp(-distance / _CORRELATION_M)
         fresh = math.sqrt(1 - keep**2)
         drawn = tuple(
             keep * e + fresh * self._random.gauss(0.0, sd)
@@ -182,7 +174,7 @@ class Arm:
             first=first,
             speed=rate,
             brake=True,
-            acceleration=acceleration or self.halt_acceleration,
+            acceleration=acceleration or _HALT_M_S2,
         )
         self.follow(brake)
         return t + brake.duration()
@@ -235,7 +227,7 @@ class Arm:
         place, rate = moving.at(t)
         if t >= moving.start + moving.duration():
             return False
-        ahead = rate * _AHEAD_S + rate**2 / (2 * self.halt_acceleration)
+        ahead = rate * _AHEAD_S + rate**2 / (2 * _HALT_M_S2)
         return place + ahead >= found.end - 1e-6
 
     def _tracked(self) -> JointTrack | None:
@@ -264,7 +256,7 @@ class Arm:
                 here.reached[branch]
                 and dexterity_mm(self.model, here.joints[branch]) >= LEAST_DEXTERITY_MM
             )
-        low, high = self.reach_m
+        low, high = _REACH_M
         return all(math.isfinite(v) for v in raw) and low <= math.hypot(*raw[:3]) <= high
 
     def _where(self, t: float) -> tuple[Vector, Vector, Vector]:

@@ -20,15 +20,26 @@ from hw.bench.robot import CB_SERIES, E_SERIES, RobotProcess, model_of
 from hw.bench.ultrasound import ImageServer
 from hw.bench.world import World, make_world
 from hw.planning.scene import Scene
-from hw.robot.pose import pose_to_ur, ur_to_pose
 from hw.runtime.clock import Clock
-from hw.runtime.rigid import looking_rotation
+from hw.runtime.rigid import looking_rotation, pose_to_ur, ur_to_pose
 from jaxcal import InputError
 from jaxcal.runtime.array_types import Float
 
 VERSIONS = {125: CB_SERIES, 500: E_SERIES}
 """Controllers that the real client accepts, by their rate: a CB-series and an e-Series."""
 
+_OF_THE_ROBOT: dict[str, tuple[str, ...]] = {
+    **dict.fromkeys(("mute", "drop", "protective_stop", "unlock"), ()),
+    "robot_state": ("robot_mode", "safety_mode"),
+    "remote": ("on",),
+    "tcp_offset": ("offset",),
+    "payload": ("mass_kg",),
+    "speed_slider": ("fraction",),
+}
+"""Faults of the robot (:meth:`hw.bench.rtde.RtdeServer.act`), and the names of their values."""
+
+_IMAGE_HZ = 30.0
+"""Ultrasound frames per bench second."""
 _ADDRESS_TRIES = 8
 _HOVER_MM = 70.0
 
@@ -41,13 +52,9 @@ class BenchOptions:
         speed: bench seconds per wall second.
         seed: of the world, and of all chance.
         pose_hz: of the robot's stream in bench time, 125 or 500: which controller it is.
-        echo_hz: active-echo frames per bench second.
-        image_hz: ultrasound frames per bench second.
         most_images_wall_hz: cap on ultrasound frames per wall second.
         most_poses_wall_hz: cap on poses of the robot's stream per wall second.
         repeatability_mm: SD of the arm's hidden error on each axis.
-        robot_host: loopback address; empty: any free one.
-        link: of the active echo: ``pty`` or ``tcp``.
         phantom: in the tank, by name (:mod:`hw.bench.phantoms`).
         world: further changes of the world, by name (see :func:`hw.bench.world.make_world`).
     """
@@ -55,21 +62,15 @@ class BenchOptions:
     speed: float = 1.0
     seed: int = 0
     pose_hz: int = 125
-    echo_hz: float = 30.0
-    image_hz: float = 30.0
     most_images_wall_hz: float = 60.0
     most_poses_wall_hz: float = 1000.0
     repeatability_mm: float = 0.1
-    robot_host: str = ""
-    link: str = "pty"
     phantom: str = "active-echo"
     world: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name, least, largest in (
             ("speed", 0.01, 100.0),
-            ("echo_hz", 0.1, 1000.0),
-            ("image_hz", 0.1, 200.0),
             ("most_images_wall_hz", 0.1, 1000.0),
             ("most_poses_wall_hz", 50.0, 1000.0),
             ("repeatability_mm", 0.0, 10.0),
@@ -79,8 +80,6 @@ class BenchOptions:
                 raise InputError(f"bench: {name} must be {least:g} to {largest:g}, not {value}")
         if self.pose_hz not in VERSIONS:
             raise InputError(f"bench: pose_hz must be 125 or 500, not {self.pose_hz}")
-        if self.link not in ("pty", "tcp"):
-            raise InputError(f"bench: link must be pty or tcp, not {self.link!r}")
 
 
 class Assembly:
@@ -115,16 +114,14 @@ class Assembly:
         self.echo = AuspisEmulator(
             self._hear,
             clock=self.clock,
-            rate_hz=options.echo_hz,
             lines=self.world.probe.elements,
             clock_hz=self.world.clock_hz,
-            link="tcp" if options.link == "tcp" else "pty",
             seed=options.seed,
         )
         self.images = ImageServer(
             self._see,
             clock=self.clock,
-            rate_hz=min(options.image_hz, options.most_images_wall_hz / options.speed),
+            rate_hz=min(_IMAGE_HZ, options.most_images_wall_hz / options.speed),
             spacing_mm=self.camera.spacing_mm,
             seed=options.seed,
         )
@@ -197,17 +194,12 @@ class Assembly:
 
     def _start_robot(self) -> RobotProcess:
         chance = random.Random(os.getpid())
-        hosts = (
-            [self.options.robot_host]
-            if self.options.robot_host
-            else [
-                f"127.0.{chance.randrange(256)}.{chance.randrange(2, 255)}"
-                for _ in range(_ADDRESS_TRIES)
-            ]
-            + ["127.0.0.1"]
-        )
+        hosts = [
+            f"127.0.{chance.randrange(256)}.{chance.randrange(2, 255)}"
+            for _ in range(_ADDRESS_TRIES)
+        ]
         trouble: OSError | None = None
-        for host in hosts:
+        for host in [*hosts, "127.0.0.1"]:
             server = RobotProcess(
                 self.arm,
                 host,
@@ -219,7 +211,7 @@ class Assembly:
                 return server.start()
             except OSError as error:
                 trouble = error
-        raise InputError(f"bench: the robot's ports are taken at {hosts[-1]}: {trouble}")
+        raise InputError(f"bench: the robot's ports are taken at 127.0.0.1: {trouble}")
 
     def stop(self) -> None:
         """Stop every device; safe to repeat."""
@@ -240,38 +232,33 @@ class Assembly:
     # Requests
 
     def _table(self) -> dict[str, Callable[..., object]]:
-        def robot() -> RobotProcess:
-            assert self.robot is not None
-            return self.robot
-
+        echo, images = self.echo, self.images
         return {
-            "mute": lambda: robot().mute(True),
-            "drop": lambda: robot().drop(),
-            "protective_stop": lambda: robot().protective_stop(),
-            "unlock": lambda: robot().unlock(),
-            "robot_state": lambda robot_mode, safety_mode: robot().enter(robot_mode, safety_mode),
-            "remote": lambda on: robot().ask("set_remote", bool(on)),
-            "payload": lambda mass_kg: robot().set_payload(float(mass_kg)),
-            "speed_slider": lambda fraction: robot().set_speed_slider(float(fraction)),
-            "tcp_offset": lambda offset: robot().set_tcp_offset(tuple(map(float, offset))),
-            "crc_errors": lambda rate: self.echo.crc_errors(float(rate)),
-            "miss_triggers": lambda rate: self.echo.miss_triggers(float(rate)),
-            "miss_lines": lambda rate: self.echo.miss_lines(float(rate)),
-            "echo_stale": lambda: self.echo.stale(True),
-            "echo_mute": lambda: self.echo.mute(True),
-            "unplug": lambda: self.echo.unplug(),
-            "replug": lambda: self.echo.replug(),
-            "image_stale": lambda: self.images.stale(True),
-            "image_freeze": lambda: self.images.freeze(True),
-            "image_drop": lambda: self.images.drop(),
-            "image_corrupt": lambda rate: self.images.corrupt(float(rate)),
+            "crc_errors": lambda rate: echo.fault(crc_errors=float(rate)),
+            "miss_triggers": lambda rate: echo.fault(missed_triggers=float(rate)),
+            "miss_lines": lambda rate: echo.fault(missed_lines=float(rate)),
+            "echo_stale": lambda: echo.fault(stale=True),
+            "echo_mute": lambda: echo.fault(mute=True),
+            "unplug": echo.unplug,
+            "replug": echo.replug,
+            "image_stale": lambda: images.fault(stale=True),
+            "image_freeze": lambda: images.fault(frozen=True),
+            "image_drop": images.drop,
+            "image_corrupt": lambda rate: images.fault(corrupt=float(rate)),
         }
 
     def _fault(self, request: dict) -> float:
         """Bench time at which the fault was in force."""
         name = request.pop("name", None)
+        if name in _OF_THE_ROBOT:
+            assert self.robot is not None
+            wanted = _OF_THE_ROBOT[name]
+            if set(request) != set(wanted):
+                raise TypeError(f"{name} takes {', '.join(wanted) or 'no values'}")
+            return self.robot.ask(name, *(request[key] for key in wanted))
         if name not in self._faults:
-            raise InputError(f"no fault {name!r}; there are: {', '.join(self._faults)}")
+            known = ", ".join([*_OF_THE_ROBOT, *self._faults])
+            raise InputError(f"no fault {name!r}; there are: {known}")
         self._faults[name](**request)
         if name == "unplug":
             self._unplugged = True
@@ -280,7 +267,7 @@ class Assembly:
     def _recover(self, _: dict) -> None:
         """End the devices' faults. A protective stop and changes at the pendant stay."""
         if self.robot is not None:
-            self.robot.mute(False)
+            self.robot.ask("unmute")
         if self._unplugged:
             self.echo.replug()
             self._unplugged = False

@@ -17,8 +17,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from hw.bench.look import Look
 from hw.bench.phantoms import ActiveEcho, CrossWire, Mark
+from hw.bench.tank import Look
 from hw.bench.world import World
 from jaxcal import InputError
 from jaxcal.runtime.array_types import Float, UInt8

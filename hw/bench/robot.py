@@ -17,16 +17,14 @@ import queue
 import subprocess
 import sys
 import threading
-from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
 from hw.bench.arm import Arm
+from hw.bench.joints import Motion
 from hw.bench.rtde import RtdeServer
-from hw.bench.travel import Motion
-from hw.robot._process import ANSWERS, be_prompt
 from hw.runtime.clock import REAL, Clock
-from jaxcal.runtime.isolated import python_command
+from hw.runtime.processes import ANSWERS, be_prompt, finish, spawn
 
 START = (0.4, -0.1, 0.3, 0.0, 3.0, 0.2)
 """Where the arm starts by default: m and rotation vector (rad)."""
@@ -34,11 +32,6 @@ START = (0.4, -0.1, 0.3, 0.0, 3.0, 0.2)
 E_SERIES, CB_SERIES = (5, 11, 0, 108249), (3, 15, 8, 106339)
 """Controller versions of the two series of robots."""
 
-_FAULTS = (
-    *("mute", "drop", "protective_stop", "unlock", "enter", "play", "set_remote"),
-    *("set_tcp_offset", "set_payload", "set_speed_slider", "set_overspeed", "spoil_dashboard"),
-)
-"""Methods of the server that may be asked for."""
 _PATIENCE_S = 30.0
 
 
@@ -79,7 +72,7 @@ class RobotProcess:
         }
         self._asking = threading.Lock()
         self._answers: queue.SimpleQueue[dict] = queue.SimpleQueue()
-        self.process: subprocess.Popen[str] | None = None
+        self.process: subprocess.Popen[bytes] | None = None
         self._thread: threading.Thread | None = None
 
     def start(self) -> RobotProcess:
@@ -88,12 +81,7 @@ class RobotProcess:
         Raises:
             OSError: its address is taken.
         """
-        self.process = subprocess.Popen(
-            python_command("hw.bench.robot", json.dumps(self._setup)),
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
+        self.process = spawn("hw.bench.robot", json.dumps(self._setup), stdin=True, stderr=None)
         self._thread = threading.Thread(target=self._receive, name="robot's process", daemon=True)
         self._thread.start()
         told = self._answer()
@@ -108,12 +96,9 @@ class RobotProcess:
         if self.process is None:
             return
         self.process.kill()
-        self.process.wait()
+        finish(self.process, _PATIENCE_S)
         if self._thread is not None:
             self._thread.join()
-        if self.process.stdin is not None:
-            with contextlib.suppress(OSError):
-                self.process.stdin.close()
 
     def __enter__(self) -> RobotProcess:
         return self.start()
@@ -121,44 +106,12 @@ class RobotProcess:
     def __exit__(self, *_: object) -> None:
         self.stop()
 
-    def mute(self, on: bool = True) -> None:
-        """As :meth:`hw.bench.rtde.RtdeServer.mute`."""
-        self.ask("mute", on)
-
-    def drop(self, *, control_only: bool = False) -> None:
-        """Reset the clients' connections, or only those that command."""
-        self.ask("drop control" if control_only else "drop")
-
-    def protective_stop(self) -> None:
-        """As if the arm had met an obstacle."""
-        self.ask("protective_stop")
-
-    def unlock(self) -> None:
-        """What a person does at the pendant after a protective stop."""
-        self.ask("unlock")
-
-    def enter(self, robot_mode: int, safety_mode: int) -> None:
-        """As :meth:`hw.bench.rtde.RtdeServer.enter`."""
-        self.ask("enter", robot_mode, safety_mode)
-
-    def set_tcp_offset(self, offset: Sequence[float]) -> None:
-        """What a person does at the pendant: another tool (m, rad)."""
-        self.ask("set_tcp_offset", tuple(offset))
-
-    def set_payload(self, mass_kg: float, cog_m: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
-        """What a person does at the pendant: another payload."""
-        self.ask("set_payload", mass_kg, tuple(cog_m))
-
-    def set_speed_slider(self, fraction: float) -> None:
-        """What a person does at the pendant."""
-        self.ask("set_speed_slider", fraction)
-
     def state(self) -> dict:
         """Where the arm is, what the program does, every command and the packets so far."""
         return self.ask("state")
 
     def ask(self, name: str, *values: object) -> Any:
-        """One request: ``state``, ``force`` or a fault (the last two answer with the bench time).
+        """``state``, or what the controller shall do (:meth:`hw.bench.rtde.RtdeServer.act`).
 
         Raises:
             RuntimeError: the child is gone, or does not know the request.
@@ -167,7 +120,7 @@ class RobotProcess:
             assert self.process is not None
             assert self.process.stdin is not None
             with contextlib.suppress(OSError, ValueError):
-                self.process.stdin.write(json.dumps([name, *values]) + "\n")
+                self.process.stdin.write(json.dumps([name, *values]).encode() + b"\n")
                 self.process.stdin.flush()
             told = self._answer()
         if "trouble" in told:
@@ -239,18 +192,12 @@ def _state(robot: RtdeServer) -> dict:
 
 
 def _do(robot: RtdeServer, name: str, values: list) -> dict:
-    match name:
-        case "state":
-            return {"answer": _state(robot)}
-        case "force":
-            robot.arm.force = tuple(values[0])
-        case "drop control":
-            robot.drop(control_only=True)
-        case _ if name in _FAULTS:
-            getattr(robot, name)(*values)
-        case _:
-            return {"trouble": f"unknown request {name}"}
-    return {"answer": robot.clock.now()}
+    if name == "state":
+        return {"answer": _state(robot)}
+    try:
+        return {"answer": robot.act(name, *values)}
+    except (ValueError, TypeError, TimeoutError) as error:
+        return {"trouble": str(error)}
 
 
 def main() -> None:

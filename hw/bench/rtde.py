@@ -20,7 +20,6 @@ ur_client_library, and what ur_rtde 1.6.5 sends and expects.
 from __future__ import annotations
 
 import contextlib
-import functools
 import math
 import queue
 import random
@@ -30,12 +29,12 @@ import struct
 import sys
 import threading
 from collections.abc import Callable
+from concurrent.futures import Future
 from typing import Any
 
 from hw.bench.arm import Arm
 from hw.bench.controller import NORMAL, Controller
 from hw.bench.rtde_fields import INPUTS, OUTPUTS, STRUCT, output_type
-from hw.robot._process import ANSWERS, be_prompt
 from hw.robot.identity import (
     DASHBOARD_PORT,
     KINEMATICS,
@@ -45,6 +44,7 @@ from hw.robot.identity import (
 )
 from hw.robot.kinematics import MODELS
 from hw.runtime.clock import REAL, Clock
+from hw.runtime.processes import ANSWERS, be_prompt
 
 __all__ = ["Arm", "RtdeServer"]
 
@@ -52,15 +52,8 @@ DASHBOARD, PRIMARY, SCRIPT, RTDE = DASHBOARD_PORT, PRIMARY_PORT, 30003, 30004
 _MAX_WAITING = 1 << 16
 """Bytes that may wait for a client that does not read; further packets for it are dropped."""
 _ROBOT_MESSAGE = 20
-_ROBOT_MODES = (
-    *("DISCONNECTED", "CONFIRM_SAFETY", "BOOTING", "POWER_OFF"),
-    *("POWER_ON", "IDLE", "BACKDRIVE", "RUNNING"),
-)
-_SAFETY_MODES = (
-    *("NORMAL", "NORMAL", "REDUCED", "PROTECTIVE_STOP", "RECOVERY", "SAFEGUARD_STOP"),
-    *("SYSTEM_EMERGENCY_STOP", "ROBOT_EMERGENCY_STOP", "VIOLATION", "FAULT"),
-)
-"""The dashboard's words for robot_mode and safety_mode."""
+_CLOCK_AHEAD_S = 1000.0
+"""The controller's time less bench time."""
 _LATE_S = 1.0
 _HELD_S = 0.01
 """Bench time after which this process counts as held up by the machine."""
@@ -81,16 +74,6 @@ class _Connection:
         self.started = False
 
 
-def _in_the_loop(act: Callable[..., None]) -> Callable[..., None]:
-    """A method that the serving thread executes; it has acted when the call returns."""
-
-    @functools.wraps(act)
-    def called(self: RtdeServer, *values: Any, **named: Any) -> None:
-        self._call(lambda: act(self, *values, **named))
-
-    return called
-
-
 class RtdeServer:
     """Serves one arm at one loopback address.
 
@@ -98,14 +81,9 @@ class RtdeServer:
         arm: what moves.
         host: 127.0.0.x.
         version: (major, minor, bugfix, build) of the controller.
-        clock: bench time; the controller's own time is this plus an offset and a drift.
-        frequency_hz: packets per bench second; by default 500 from version 5 on, else 125.
+        clock: bench time; the controller's own time is a thousand seconds ahead.
         max_rate_hz: packets per wall second, whatever the clock's speed asks for.
         serial: what the dashboard says; the arm's kinematic calibration is drawn from it.
-        offset_s: controller time at bench time zero.
-        drift_ppm: of the controller's time against bench time.
-
-    Faults: :meth:`mute`, :meth:`drop`, :meth:`protective_stop`; each acts before it returns.
     """
 
     def __init__(
@@ -115,15 +93,12 @@ class RtdeServer:
         *,
         version: tuple[int, int, int, int] = (5, 11, 0, 108249),
         clock: Clock = REAL,
-        frequency_hz: float | None = None,
         max_rate_hz: float = 1000.0,
         serial: str = "20195500042",
-        offset_s: float = 1000.0,
-        drift_ppm: float = 0.0,
     ) -> None:
         self.arm, self.host, self.version, self.clock = arm, host, version, clock
         self.serial = serial
-        nominal = frequency_hz or (500.0 if version[0] >= 5 else 125.0)
+        nominal = 500.0 if version[0] >= 5 else 125.0
         self.frequency_hz = min(nominal, max_rate_hz / clock.speed)
         self.controller = Controller(arm, told=self._say_why)
         self.asked: list[str] = []
@@ -133,11 +108,10 @@ class RtdeServer:
         self.skipped = 0
         self.late = 0
         """Packets never made because this process was held up for more than a second."""
-        self._offset, self._rate = offset_s, 1.0 + drift_ppm * 1e-6
         self._selector = selectors.SelectSelector()
         self._connections: set[_Connection] = set()
         self._listeners: list[socket.socket] = []
-        self._calls: queue.SimpleQueue[tuple[Callable[[], None], threading.Event]] = (
+        self._calls: queue.SimpleQueue[tuple[Callable[[], None], Future[None]]] = (
             queue.SimpleQueue()
         )
         self._wake, self._woken = socket.socketpair()
@@ -188,9 +162,67 @@ class RtdeServer:
 
     # Faults
 
-    @_in_the_loop
-    def mute(self, on: bool = True) -> None:
-        """Neither read nor write; connections stay, and new ones are accepted but not answered."""
+    def act(self, name: str, *values: Any) -> float:
+        """Do something to the robot or its controller, as a person at the pendant or a fault does.
+
+        - ``mute``: neither read nor write; connections stay, and new ones are accepted but not
+          answered; ``unmute``;
+        - ``drop``: reset all clients' connections; ``drop control``: only those that command;
+        - ``protective_stop``: as if the arm had met an obstacle; ``unlock``;
+        - ``robot_state`` (robot_mode, safety_mode): :meth:`hw.bench.controller.Controller.enter`;
+        - ``force`` (N and N m): on the tool;
+        - ``remote`` (on): remote or local control of an e-Series;
+        - ``play``: our program ends, and soon another one runs;
+        - ``tcp_offset`` (m, rad), ``payload`` (kg and, or not, its centre of gravity, m),
+          ``speed_slider`` (0 to 1): other settings at the pendant;
+        - ``overspeed`` (factor): motions from now on are so many times as fast as commanded;
+        - ``dashboard`` (text): it answers with this text, with "" not at all, with None as usual.
+
+        Returns:
+            Bench time (s) at which it was done.
+
+        Raises:
+            ValueError: nothing that can be done.
+        """
+        self._call(lambda: self._act(name, *values))
+        return self.clock.now()
+
+    def _act(self, *wanted: Any) -> None:
+        program, t = self.controller, self.clock.now()
+        match wanted:
+            case ["mute" | "unmute" as name]:
+                self._mute(name == "mute")
+            case ["drop"]:
+                self._drop(self._connections)
+            case ["drop control"]:
+                self._drop({connection for connection in self._connections if connection.inputs})
+            case ["protective_stop"]:
+                program.protect(t)
+            case ["unlock"]:
+                program.safety_mode = NORMAL
+            case ["robot_state", robot_mode, safety_mode]:
+                program.enter(t, robot_mode, safety_mode)
+            case ["force", force]:
+                self.arm.force = tuple(force)
+            case ["remote", on]:
+                program.remote = bool(on)
+            case ["play"]:
+                program.play(t)
+            case ["tcp_offset", offset]:
+                self.arm.set_tcp_offset(offset)
+            case ["payload", mass_kg, *cog_m]:
+                program.payload_kg = float(mass_kg)
+                program.payload_cog_m = tuple(cog_m[0]) if cog_m else (0.0, 0.0, 0.0)
+            case ["speed_slider", fraction]:
+                program.speed_fraction = float(fraction)
+            case ["overspeed", factor]:
+                program.overspeed = float(factor)
+            case ["dashboard", answer]:
+                self._dashboard_says = answer
+            case _:
+                raise ValueError(f"unknown request {wanted}")
+
+    def _mute(self, on: bool) -> None:
         self._muted = on
         for connection in self._connections:
             known = connection.socket in self._selector.get_map()
@@ -200,74 +232,21 @@ class RtdeServer:
             elif not on and not known:
                 self._selector.register(connection.socket, selectors.EVENT_READ, connection)
 
-    @_in_the_loop
-    def drop(self, *, control_only: bool = False) -> None:
-        """Reset all clients' connections, or only those that command."""
-        for connection in [c for c in self._connections if c.inputs or not control_only]:
+    def _drop(self, connections: set[_Connection]) -> None:
+        for connection in list(connections):
             linger = struct.pack("ii", 1, 0)
             connection.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, linger)
             self._forget(connection)
 
-    @_in_the_loop
-    def protective_stop(self) -> None:
-        """As if the arm had met an obstacle."""
-        self.controller.protect(self.clock.now())
-
-    @_in_the_loop
-    def unlock(self) -> None:
-        """What a person does at the pendant after a protective stop."""
-        self.controller.safety_mode = NORMAL
-
-    @_in_the_loop
-    def enter(self, robot_mode: int, safety_mode: int) -> None:
-        """The robot enters these modes; see :meth:`hw.bench.controller.Controller.enter`."""
-        self.controller.enter(self.clock.now(), robot_mode, safety_mode)
-
-    @_in_the_loop
-    def set_remote(self, on: bool) -> None:
-        """What a person does at the pendant of an e-Series: remote or local control."""
-        self.controller.remote = on
-
-    @_in_the_loop
-    def play(self) -> None:
-        """What a person does at the pendant: the program ends, and soon another one runs."""
-        self.controller.play(self.clock.now())
-
-    @_in_the_loop
-    def spoil_dashboard(self, answer: str | None) -> None:
-        """The dashboard answers with this text, with "" not at all, with None as usual."""
-        self._dashboard_says = answer
-
-    @_in_the_loop
-    def set_tcp_offset(self, offset: tuple[float, ...]) -> None:
-        """What a person does at the pendant: another tool."""
-        self.arm.set_tcp_offset(offset)
-
-    @_in_the_loop
-    def set_payload(self, mass_kg: float, cog_m: tuple[float, ...]) -> None:
-        """What a person does at the pendant: another payload."""
-        self.controller.payload_kg = float(mass_kg)
-        self.controller.payload_cog_m = tuple(cog_m)
-
-    @_in_the_loop
-    def set_speed_slider(self, fraction: float) -> None:
-        """What a person does at the pendant; motions from now on are slower."""
-        self.controller.speed_fraction = float(fraction)
-
-    @_in_the_loop
-    def set_overspeed(self, factor: float) -> None:
-        """Motions from now on are so many times as fast as commanded."""
-        self.controller.overspeed = float(factor)
-
     def _call(self, act: Callable[[], None]) -> None:
+        """Have the serving thread do something; returns when it is done."""
         if self._thread is None or threading.current_thread() is self._thread:
             act()
             return
-        done = threading.Event()
+        done: Future[None] = Future()
         self._calls.put((act, done))
         self._wake.send(b"x")
-        if not done.wait(5.0):
-            raise TimeoutError("the emulated controller does not answer")
+        done.result(5.0)
 
     # The loop
 
@@ -286,8 +265,10 @@ class RtdeServer:
                     self._ready(key.fileobj, key.data)
                 while not self._calls.empty():
                     act, done = self._calls.get()
-                    act()
-                    done.set()
+                    try:
+                        done.set_result(act())
+                    except Exception as error:
+                        done.set_exception(error)
                 now = self.clock.now()
                 if now - min(woken, due) > _HELD_S:
                     # A real controller is never held up, neither as it wakes nor as it works: what
@@ -411,7 +392,7 @@ class RtdeServer:
         program, arm = self.controller, self.arm
         raw, velocity = arm.raw(t), arm.velocity(t)
         values: dict[str, tuple[float, ...] | float | int] = {
-            "timestamp": self._offset + self._rate * t,
+            "timestamp": _CLOCK_AHEAD_S + t,
             "actual_TCP_pose": raw,
             "target_TCP_pose": raw,
             "actual_TCP_speed": velocity,
@@ -599,21 +580,9 @@ class RtdeServer:
                 return "UR5" if model is None else model.name.removesuffix("e")
             case "is in remote control" if self._since(None, (5, 6)):
                 return "true" if program.remote else "false"
-            case "robotmode":
-                return f"Robotmode: {_ROBOT_MODES[program.robot_mode]}"
-            case "safetystatus" if self._since(None, (5, 4)):
-                return f"Safetystatus: {_SAFETY_MODES[program.safety_mode]}"
-            case "safetymode":
-                return f"Safetymode: {_SAFETY_MODES[program.safety_mode]}"
-            case "programstate":
-                return f"{'PLAYING' if program.running else 'STOPPED'} rtde_control"
-            case "running":
-                return f"Program running: {'true' if program.running else 'false'}"
             case "stop":
                 program.halt(self.clock.now(), "the dashboard stopped it")
                 return "Stopped"
-            case "unlock protective stop":
-                return "Protective stop releasing"
             case _:
                 return f"could not understand: '{line}'"
 

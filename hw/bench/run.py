@@ -1,9 +1,8 @@
 """The emulated bench: one world behind three devices and a control socket, in a process of its own.
 
-    python -m hw.bench.run --speed 5 --seed 1
-
-prints one JSON line with the addresses and serves until its standard input ends, so that a bench
-never outlives the process that started it. Programs call :func:`start_bench`.
+It prints one JSON line with the addresses and serves until its standard input ends, so that a bench
+never outlives the process that started it. Programs call :func:`start_bench`, a person
+``jaxcal-hw bench``.
 """
 
 from __future__ import annotations
@@ -25,10 +24,10 @@ from hw.bench.assembly import Assembly, BenchOptions
 from hw.bench.control import ControlClient
 from hw.planning.scene import Scene
 from hw.runtime.clock import Clock
+from hw.runtime.processes import finish, spawn
 from jaxcal import InputError
 from jaxcal.data.probe import LinearProbe
 from jaxcal.runtime.array_types import Float
-from jaxcal.runtime.isolated import python_command
 
 __all__ = ["Bench", "BenchOptions", "main", "serve", "start_bench"]
 
@@ -116,6 +115,10 @@ class Bench:
         found = np.array(self._control.ask("truth", pose=pose.tolist()))
         return found.reshape(*pose.shape[:-2], 3)
 
+    def elevation_mm(self) -> float:
+        """The target's true elevational offset now, mm."""
+        return float(self.truth(self.true_pose())[2])
+
     def world_truth(self) -> dict[str, np.ndarray]:
         """``image_to_probe`` (4, 4), ``point_mm`` (3,), ``sound_speed_m_s``, ``latency_s``."""
         told = self._control.ask("world")
@@ -139,14 +142,7 @@ class Bench:
     def close(self) -> None:
         """End the bench's process; safe to repeat."""
         self._control.close()
-        if self._process.stdin is not None:
-            with contextlib.suppress(OSError):
-                self._process.stdin.close()
-        try:
-            self._process.wait(timeout=10.0)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        finish(self._process, 10.0)
         if self._process.stdout is not None:
             self._process.stdout.close()
 
@@ -162,13 +158,8 @@ def start_bench(**options: Any) -> Bench:
     """
     chosen = BenchOptions(**options)
     with tempfile.TemporaryFile() as complaints:
-        process = subprocess.Popen(
-            python_command("hw.bench.run", "--json", json.dumps(asdict(chosen))),
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=complaints,
-            start_new_session=True,
-        )
+        options_text = json.dumps(asdict(chosen))
+        process = spawn("hw.bench.run", options_text, stdin=True, stderr=complaints)
         assert process.stdout is not None
         line = _first_line(process)
         if not line:
@@ -217,21 +208,10 @@ def _until_parent_ends(assembly: Assembly) -> None:
     assembly.end()
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run a bench by ``--json {...}`` or by ``--speed`` and ``--seed``."""
-    import argparse
-
-    parser = argparse.ArgumentParser(description="An emulated bench on loopback.")
-    parser.add_argument("--speed", type=float, default=1.0)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", default="", help="all options as one JSON object")
-    given = parser.parse_args(arguments)
+def main(options: str) -> int:
+    """Run a bench with :class:`BenchOptions` as one JSON object, until standard input ends."""
     try:
-        if given.json:
-            options = BenchOptions(**json.loads(given.json))
-        else:
-            options = BenchOptions(speed=given.speed, seed=given.seed)
-        serve(options, of_parent=True)
+        serve(BenchOptions(**json.loads(options)), of_parent=True)
     except (InputError, TypeError, json.JSONDecodeError) as error:
         print(" ".join(str(error).split()), file=sys.stderr)
         return 2
@@ -239,4 +219,4 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(sys.argv[1]))

@@ -31,7 +31,15 @@ _CLOCK_AHEAD_S = 1_000_000.0
 
 
 @dataclass(frozen=True)
-class _Faults:
+class ImageFaults:
+    """Faults that streams have.
+
+    Attributes:
+        stale: nothing is sent, connections open.
+        frozen: the last image comes again and again, its time stamp too.
+        corrupt: share of the images in which a bit is flipped anywhere, header included.
+    """
+
     stale: bool = False
     frozen: bool = False
     corrupt: float = 0.0
@@ -80,7 +88,7 @@ class ImageServer:
         self._render, self._rf, self._transforms = render, rf, transforms
         self._clock, self._period_s, self._spacing = clock, 1.0 / rate_hz, spacing_mm
         self._random = np.random.default_rng(seed)
-        self._faults = _Faults()
+        self._faults = ImageFaults()
         self._stopping = self._dropping = False
         self._clients: dict[int, _Client] = {}
         self._selector = selectors.DefaultSelector()
@@ -116,17 +124,9 @@ class ImageServer:
 
     # Faults
 
-    def stale(self, on: bool = True) -> None:
-        """Send nothing, connections open."""
-        self._faults = replace(self._faults, stale=on)
-
-    def freeze(self, on: bool = True) -> None:
-        """Send the last image again and again, its time stamp too."""
-        self._faults = replace(self._faults, frozen=on)
-
-    def corrupt(self, rate: float) -> None:
-        """Flip a bit anywhere in this share of the images, header included."""
-        self._faults = replace(self._faults, corrupt=rate)
+    def fault(self, **changes: float | bool) -> None:
+        """Begin or end some faults: attributes of :class:`ImageFaults`, by name."""
+        self._faults = replace(self._faults, **changes)
 
     def drop(self) -> None:
         """Close all connections once; new ones are taken."""
@@ -134,7 +134,7 @@ class ImageServer:
 
     def recover(self) -> None:
         """No fault any more."""
-        self._faults = _Faults()
+        self._faults = ImageFaults()
 
     # The machine
 

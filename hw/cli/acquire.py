@@ -6,7 +6,8 @@ import sys
 from collections.abc import Callable
 from contextlib import ExitStack
 from datetime import datetime
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -58,6 +59,7 @@ _RESUMED_BY_ITSELF = 30
 )
 @click.option(
     "--until-tre",
+    "until_tre_mm",
     type=POSITIVE,
     metavar="MM",
     help="With --plan optimal: stop once the predicted error over the image is this small.",
@@ -108,14 +110,6 @@ def acquire(
     recording: str | None,
     bench: bool,
     setup_path: str | None,
-    images: int | None,
-    plan: str | None,
-    until_tre: float | None,
-    placement: str | None,
-    phantom: str | None,
-    operator: str | None,
-    seed: int | None,
-    every_frame: bool,
     resume: bool,
     move: bool,
     unattended: str | None,
@@ -124,6 +118,7 @@ def acquire(
     speed: float | None,
     controller: str | None,
     bench_seed: int | None,
+    **wanted: Any,
 ) -> int:
     """Take the images of a plan of poses, and calibrate from them.
 
@@ -136,37 +131,21 @@ def acquire(
         raise InputError("--speed, --controller and --bench-seed need --bench")
     if resume:
         check_resumed(recording, *_ALSO_RESUMED)
-    if operator is not None and not resume and placement != "pattern-injection":
+    if wanted["operator"] and not resume and wanted["placement"] != "pattern-injection":
         raise InputError("--operator needs --placement pattern-injection")
-    if until_tre is not None and plan != "optimal" and not resume:
+    if wanted["until_tre_mm"] is not None and wanted["plan"] != "optimal" and not resume:
         raise InputError("--until-tre needs --plan optimal")
     if unattended is not None and not move:
         raise InputError("--unattended needs --move")
     if view and not (bench or move):
         raise InputError("--view needs --move: a dry run has nothing to show")
-    request = None
     if resume:
         assert recording is not None
-        recorded = _recorded(recording, bench)
-        bench_seed, phantom, operator = recorded.bench, recorded.phantom, recorded.operator
+        request = _recorded(recording, bench)
+        bench_seed = request.bench
     else:
-        from hw.acquisition.request import AcquisitionRequest
-
-        phantom = phantom or PHANTOMS[0]
-        if operator is None:
-            asks = placement == "pattern-injection" and not bench
-            operator = "person" if asks else "simulated"
-        request = AcquisitionRequest(
-            images or 60,
-            placement or PLACEMENTS_OF[phantom][0],
-            seed or 0,
-            every_frame,
-            (bench_seed or 0) if bench else None,
-            operator,
-            plan or PLANS[0],
-            until_tre,
-            phantom,
-        )
+        request = _requested((bench_seed or 0) if bench else None, wanted)
+    phantom, operator = request.phantom, request.operator
     _check_installed(phantom, bench, move)
     path = recording or f"acquisition-{datetime.now():%Y%m%d-%H%M%S}.h5"
     from jaxcal.runtime.jax_cache import enable_compilation_cache
@@ -178,16 +157,29 @@ def acquire(
         if not bench and not move:
             from hw.acquisition.dry_run import dry_run
 
-            for line in dry_run(setup, path, request, preview):
+            for line in dry_run(setup, path, None if resume else request, preview):
                 click.echo(line)
             return ExitCode.CONVERGED
         if preview is not None:
-            from hw.acquisition.dry_run import draw
+            from hw.acquisition.request import planned
+            from hw.planning.poses import preview as draw
 
-            if request is None:
+            if resume:
                 raise InputError("--preview draws a new plan; it cannot be used with --resume")
-            draw(setup, request, preview)
-        return _acquire(setup, path, request, emulated, unattended, operator, view)
+            draw(planned(setup, request), Path(preview))
+        new = None if resume else request
+        return _acquire(setup, path, new, emulated, unattended, operator, view)
+
+
+def _requested(bench: int | None, wanted: dict[str, Any]) -> AcquisitionRequest:
+    """What the options ask for; those that were not given are chosen here."""
+    from hw.acquisition.request import AcquisitionRequest
+
+    given = {name: value for name, value in wanted.items() if value is not None}
+    placement = given.setdefault("placement", PLACEMENTS_OF[given.get("phantom", PHANTOMS[0])][0])
+    by_person = placement == "pattern-injection" and bench is None
+    given.setdefault("operator", "person" if by_person else "simulated")
+    return AcquisitionRequest(**given, bench=bench)
 
 
 def _recorded(recording: str, bench: bool) -> AcquisitionRequest:
@@ -232,7 +224,6 @@ def _acquire(
     from hw.acquisition.acquire import acquire as run_acquisition
     from hw.midplane.terminal_image import Screen
     from hw.runtime.keys import Pause, watch_keys
-    from hw.setup.emulated import BenchOracle
 
     pause, screen = Pause(), Screen(sys.stderr)
     confirming = confirming_by(setup.clock, emulated is not None, unattended)
@@ -253,7 +244,7 @@ def _acquire(
             request,
             confirm,
             say=say,
-            oracle=None if emulated is None else BenchOracle(emulated),
+            emulated=emulated,
             operator=_operators(operator, keyboard, screen),
             pause=pause,
             view=view,

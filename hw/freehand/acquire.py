@@ -8,21 +8,20 @@ from __future__ import annotations
 
 import json
 import os
-import time
 from dataclasses import replace
 
 import numpy as np
 
 from hw.freehand.guide import Guide, Taken
-from hw.freehand.kept import KeptImages, read_images
 from hw.freehand.posed import PosedImages
-from hw.freehand.request import FreeHand, FreeHandStopped, Person, recorded_request
+from hw.freehand.request import FreeHand, Person, recorded_request
+from hw.freehand.run import KeptImages, Run, read_images
 from hw.recording.layout import RecordingHeader
 from hw.recording.recorder import Recorder
 from hw.runtime.errors import DeviceError
 from hw.ultrasound.receiver import UltrasoundStream
-from jaxcal import CalibrationError, InputError
-from jaxcal.data.recording import MINIMUM_IMAGES, Recording, make_images
+from jaxcal import CalibrationError
+from jaxcal.data.recording import Recording, make_images
 from jaxcal.data.segmentation.image import check_region
 
 _KIND = "free-hand"
@@ -74,18 +73,13 @@ def acquire_free_hand(
             recorder = Recorder(path, header)
         # Recordings of older versions do not tell it.
         run = _Run(asked, guide, person, posed, recorder, kept, spacing or posed.spacing_mm)
-        try:
-            with recorder:
-                return run.go()
-        except KeyboardInterrupt:
-            reason, interrupted = "interrupted", True
-        except (DeviceError, CalibrationError) as error:
-            reason, interrupted = str(error), False
-    raise FreeHandStopped(reason, len(kept), asked, recorder.kept, interrupted=interrupted)
+        return run.completed()
 
 
-class _Run:
-    """One run over an open stream and an open recording."""
+class _Run(Run):
+    """Images are taken when the probe is held still; the guide judges them."""
+
+    ends = ("q", "enter")
 
     def __init__(
         self,
@@ -97,37 +91,25 @@ class _Run:
         kept: KeptImages,
         spacing_mm: tuple[float, float],
     ) -> None:
-        self._asked, self._guide, self._person = asked, guide, person
-        self._posed, self._recorder, self._kept = posed, recorder, kept
-        self._spacing_mm = spacing_mm
-        self._size = (0, 0)
+        super().__init__(asked, person, posed, recorder, kept)
+        self._guide, self._spacing_mm = guide, spacing_mm
 
-    def go(self) -> int:
-        """Run until enough images are taken, or the person ends it."""
-        asked, guide = self._asked, self._guide
-        self._note("started", f"{asked.images - len(guide.taken)} images to take")
+    def begin(self) -> None:
+        """Record the frames of the poses, and the size of the pixels."""
         source, target = self._posed.pair
         self._recorder.attributes("calibration", {"pose_from": source, "pose_to": target})
-        if asked.spacing_mm is not None:
-            self._recorder.attributes("calibration", {"spacing_mm": list(asked.spacing_mm)})
-        while len(guide.taken) < asked.images:
-            key = self._person.key()
-            if key in ("q", "enter"):
-                break
-            if key == "u":
-                self._take_back()
-            posed = self._posed.read(_SILENCE_S)
-            frame = posed.image.array
-            self._size = (frame.shape[1], frame.shape[0])
-            look = guide.look(posed)
-            if look.taken is not None:
-                self._keep(look.taken)
-            self._person.show(frame, look.words, guide.advice(self._size))
-        if len(guide.taken) < MINIMUM_IMAGES:
-            raise InputError(f"{len(guide.taken)} images are too few: {MINIMUM_IMAGES} are needed")
-        self._note("finished", f"{len(guide.taken)} images")
-        self._recorder.finish()
-        return len(guide.taken)
+        if self._asked.spacing_mm is not None:
+            self._recorder.attributes("calibration", {"spacing_mm": list(self._asked.spacing_mm)})
+
+    def look(self, key: str | None) -> None:
+        """Read an image, and keep it if the guide takes it."""
+        posed = self._posed.read(_SILENCE_S)
+        frame = posed.image.array
+        look = self._guide.look(posed)
+        if look.taken is not None:
+            self._keep(look.taken)
+        advice = self._guide.advice((frame.shape[1], frame.shape[0]))
+        self._person.show(frame, look.words, advice)
 
     def _keep(self, taken: Taken) -> None:
         assert taken.posed is not None
@@ -156,13 +138,11 @@ class _Run:
                 device="ultrasound",
             )
 
-    def _take_back(self) -> None:
-        if not self._guide.taken:
-            return
-        self._kept.take_back(self._recorder)
+    def take_back(self) -> None:
+        """Forget it in the guide, too."""
+        super().take_back()
         self._guide.taken.pop()
         self._guide.forget()
-        self._note("taken back", f"the last image; {len(self._guide.taken)} are left")
 
     def _estimate(self) -> str:
         """How well the images so far agree, and which one does not."""
@@ -190,10 +170,6 @@ class _Run:
             if worst == len(taken) - 1:
                 text += " (u removes it)"
         return text
-
-    def _note(self, kind: str, text: str) -> None:
-        self._recorder.add_event(kind, text, time.monotonic())
-        self._person.say(f"{kind}: {text}")
 
 
 def _found(posed: PosedImages) -> list[str]:

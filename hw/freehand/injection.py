@@ -25,9 +25,9 @@ import numpy as np
 
 from hw.active_echo.device import ActiveEcho, EchoFrame
 from hw.freehand.guide import mean_pose, spread_of
-from hw.freehand.kept import KeptImages, read_images
 from hw.freehand.posed import PosedImage, PosedImages, pose_at_arrival
-from hw.freehand.request import FreeHand, FreeHandStopped, Person, recorded_request
+from hw.freehand.request import FreeHand, Person, recorded_request
+from hw.freehand.run import KeptImages, Run, read_images
 from hw.midplane.amplitude_scan import fit_peak
 from hw.midplane.bracket import Bracket
 from hw.midplane.live_view import describe, profile
@@ -46,9 +46,8 @@ from hw.recording.session import DELAY_S, Watch, median_times
 from hw.runtime.errors import DeviceError, StaleError
 from hw.setup.description import HandHeldSetup
 from hw.ultrasound.receiver import UltrasoundStream
-from jaxcal import CalibrationError, InputError
 from jaxcal.data.poses import inverse_poses
-from jaxcal.data.recording import MINIMUM_IMAGES, MetresError, check_pose_units
+from jaxcal.data.recording import MetresError, check_pose_units
 from jaxcal.io.given_files import naming
 from jaxcal.runtime.array_types import Float
 
@@ -134,21 +133,8 @@ def acquire_by_injection(
         unit = described_electronics(echo)
         changes = compare_electronics(before, unit)
         recorder = Recorder(path) if resume else _recorder(path, asked, setup, posed)
-        try:
-            with recorder:
-                recorder.attributes("ae", unit)
-                run = _Run(asked, setup, person, posed, echo, recorder, kept)
-                for change in changes:
-                    run.note("changed", change)
-                return run.go()
-        except KeyboardInterrupt:
-            reason, interrupted = "interrupted", True
-        except (DeviceError, CalibrationError) as error:
-            reason, interrupted = str(error), False
-    options = ("--placement", _KIND, "--setup", "TOML")
-    raise FreeHandStopped(
-        reason, len(kept), asked, recorder.kept, *options, interrupted=interrupted
-    )
+        run = _Run(asked, setup, person, posed, echo, unit, changes, recorder, kept)
+        return run.completed()
 
 
 def _scene(setup: HandHeldSetup) -> dict[str, Any]:
@@ -178,8 +164,10 @@ def _switch_off(echo: ActiveEcho) -> None:
         echo.inject(False)
 
 
-class _Run:
-    """One run over open devices and an open recording."""
+class _Run(Run):
+    """Images are taken when the person accepts a place in the middle of a sweep."""
+
+    options = ("--placement", _KIND, "--setup", "TOML")
 
     def __init__(
         self,
@@ -188,11 +176,13 @@ class _Run:
         person: Person,
         posed: PosedImages,
         echo: ActiveEcho,
+        unit: dict[str, float | str],
+        changes: list[str],
         recorder: Recorder,
         kept: KeptImages,
     ) -> None:
-        self._asked, self._setup, self._person = asked, setup, person
-        self._posed, self._echo, self._recorder, self._kept = posed, echo, recorder, kept
+        super().__init__(asked, person, posed, recorder, kept)
+        self._setup, self._echo, self._unit, self._changes = setup, echo, unit, changes
         self._images: deque[PosedImage] = deque(maxlen=_RECENT)
         self._waiting: list[EchoFrame] = []
         self._held: deque[tuple[float, np.ndarray, EchoFrame]] = deque()
@@ -201,44 +191,33 @@ class _Run:
         self._heard, self._shown = time.monotonic(), 0.0
         self._delay_measured = -np.inf
         self._late_s = 0.0
-        self._begin()
+        self._new_sweep()
 
-    @property
-    def count(self) -> int:
-        """Images that count."""
-        return len(self._kept)
+    def begin(self) -> None:
+        """Record the electronics, and what has changed since the recording was begun."""
+        self._recorder.attributes("ae", self._unit)
+        for change in self._changes:
+            self.note("changed", change)
 
-    def go(self) -> int:
-        """Run until enough images are accepted, or the person ends it."""
-        self.note("started", f"{self._asked.images - self.count} images to take")
-        while self.count < self._asked.images:
-            key = self._person.key()
-            if key == "q":
-                break
-            if key == "s":
-                self._begin()
-            elif key == "u":
-                self._take_back()
-            self._look()
-            if key == "enter":
-                self._message = self._accept()
-            self._show()
-        if self.count < MINIMUM_IMAGES:
-            raise InputError(f"{self.count} images are too few: {MINIMUM_IMAGES} are needed")
-        self.note("finished", f"{self.count} images")
-        self._recorder.finish()
-        return self.count
+    def look(self, key: str | None) -> None:
+        """Add what has come to the sweep; begin it anew, or accept the place, by a key."""
+        if key == "s":
+            self._new_sweep()
+        self._listen()
+        if key == "enter":
+            self._message = self._accept()
+        self._show()
 
     # The sweep
 
-    def _begin(self) -> None:
+    def _new_sweep(self) -> None:
         """Begin a new sweep; places count from where the element is heard first."""
         self._samples: deque[Sample] = deque()
         self._origin: tuple[np.ndarray, np.ndarray] | None = None
         self._held.clear()
         self._message, self._hurried = "", False
 
-    def _look(self) -> None:
+    def _listen(self) -> None:
         # Read all images that wait: the bar must show where the probe is now, however busy the PC.
         self._images.append(self._posed.read(_SILENCE_S))
         for _ in range(self._posed.behind - 1):
@@ -287,7 +266,7 @@ class _Run:
         if self._origin is not None:
             turn = spread_of(np.stack([self._origin[0], pose]))[1]
             if turn > _ANOTHER_DEG:
-                self._begin()
+                self._new_sweep()
         if self._origin is None and echoes.heard:
             self._origin = pose, self._target_of(frame, echoes.loudest_line)
         if self._origin is None:
@@ -348,7 +327,7 @@ class _Run:
             return
         self._shown = now
         frame = self._images[-1].image.array
-        title = f"image {self.count + 1} of {self._asked.images}"
+        title = f"image {len(self._kept) + 1} of {self._asked.images}"
         view = self._view()
         late = ""
         late_s = self._images[-1].image.late_s
@@ -447,21 +426,10 @@ class _Run:
         )
         self._kept.add(pose)
         self._person.say(
-            f"image {self.count}/{self._asked.images}: offset {bracket.centre_mm:+.2f} in "
+            f"image {len(self._kept)}/{self._asked.images}: offset {bracket.centre_mm:+.2f} in "
             f"[{bracket.low_mm:+.2f}, {bracket.high_mm:+.2f}] mm"
         )
-        self._begin()
-
-    def _take_back(self) -> None:
-        if not self._kept:
-            return
-        self._kept.take_back(self._recorder)
-        self.note("taken back", f"the last image; {self.count} are left")
-
-    def note(self, kind: str, text: str) -> None:
-        """Say a line, and put it among the recording's events."""
-        self._recorder.add_event(kind, text, time.monotonic())
-        self._person.say(f"{kind}: {text}")
+        self._new_sweep()
 
 
 def hand_advice(view: View, peak_mm: float) -> str:

@@ -9,13 +9,12 @@ The same fit serves a free-hand sweep, whose places come from the tracker.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from hw.midplane.bracket import Bracket, Placement, widened
-from hw.midplane.search import Bench, PlacementError, Settings, Walker, coarse, guarded
+from hw.midplane.search import PlacementError, Settings, Walker, coarse, procedure
 from jaxcal.runtime.array_types import Float
 
 LEAST_FRACTION = 0.4
@@ -195,70 +194,17 @@ def go_to_peak(walker: Walker, peak: Peak) -> tuple[float, float]:
     return where, amplitude
 
 
-def amplitude_scan(
-    bench: Bench,
-    settings: Settings | None = None,
-    start_mm: float = 0.0,
-    watch: Callable[[float, float, int], None] | None = None,
-) -> Placement:
-    """Scan with the robot, fit the maximum, go there.
-
-    Args:
-        bench: what to move and listen to.
-        settings: how to search.
-        start_mm: where the mid-plane is expected, as an offset from the plan's pose.
-        watch: told of every stop.
-
-    Returns:
-        A placement with the probe at the maximum.
-
-    Raises:
-        PlacementError: given up; the probe is at the last good place.
-    """
-    settings = Settings() if settings is None else settings
-
-    def run(walker: Walker) -> Placement:
-        heard_at = coarse(walker, start_mm)
-        peak = scan_up(walker, heard_at, settings.fine_mm)
-        try:
-            where, amplitude = go_to_peak(walker, peak)
-        except PlacementError:
-            walker.notes.append("the maximum was not found again; scanned once more")
-            again = peak.place_mm - settings.coarse_mm
-            peak = scan_up(walker, again, settings.fine_mm)
-            where, amplitude = go_to_peak(walker, peak)
-        half = settings.factor * peak.sd_mm
-        edges = (peak.place_mm - half, peak.place_mm + half)
-        return walker.placement("amplitude-scan", where, edges, peak.sd_mm, amplitude)
-
-    return guarded(Walker(bench, settings, watch), run)
-
-
-def free_hand(
-    offsets_mm: Float[np.ndarray, " n"],
-    amplitudes: Float[np.ndarray, " n"],
-    settings: Settings | None = None,
-) -> tuple[int, Bracket]:
-    """The best image of a free-hand sweep, and where the target's offset lies in it.
-
-    Args:
-        offsets_mm: tracked place of the probe along its elevational axis at every frame.
-        amplitudes: of the response in the same frames, counts; 0: not heard.
-        settings: stated accuracies; ``position_sd_mm`` is then the tracker's.
-
-    Returns:
-        Index of the loudest frame, as the paper takes it, and its bracket, whose centre says how
-        far beside the fitted maximum it was taken.
-
-    Raises:
-        PlacementError: the sweep did not cross the mid-plane.
-    """
-    settings = Settings() if settings is None else settings
-    loud = np.asarray(amplitudes, float)
-    peak = fit_peak(offsets_mm, loud, settings.full_scale)
-    usable = np.where(loud >= 0.98 * settings.full_scale, 0.0, loud)
-    # If the loudest frame is saturated, take the frame nearest to the fitted maximum.
-    best = int(np.argmax(loud))
-    if usable[best] == 0.0:
-        best = int(np.argmin(np.abs(np.asarray(offsets_mm) - peak.place_mm)))
-    return best, peak.bracket(float(offsets_mm[best]), settings)
+@procedure
+def amplitude_scan(walker: Walker, start_mm: float) -> Placement:
+    """Scan with the robot, fit the maximum, go there."""
+    settings = walker.settings
+    peak = scan_up(walker, coarse(walker, start_mm), settings.fine_mm)
+    try:
+        where, amplitude = go_to_peak(walker, peak)
+    except PlacementError:
+        walker.notes.append("the maximum was not found again; scanned once more")
+        peak = scan_up(walker, peak.place_mm - settings.coarse_mm, settings.fine_mm)
+        where, amplitude = go_to_peak(walker, peak)
+    half = settings.factor * peak.sd_mm
+    edges = (peak.place_mm - half, peak.place_mm + half)
+    return walker.placement("amplitude-scan", where, edges, peak.sd_mm, amplitude)

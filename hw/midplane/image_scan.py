@@ -13,13 +13,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from hw.midplane.amplitude_scan import amplitude_scan
 from hw.midplane.bracket import Placement
-from hw.midplane.search import Echoes, Settings
+from hw.midplane.search import Echoes, Settings, Watch
 from jaxcal.data.segmentation.image import localise
 from jaxcal.data.segmentation.speckle import SMALLEST_REGION, NotFoundError, envelope_of
 from jaxcal.data.segmentation.spot import brightest
@@ -38,20 +37,11 @@ SEEN_DB = 14.0
 speckle alone reaches about 12 dB (jaxcal.data.segmentation.image)."""
 
 
-@runtime_checkable
-class Mover(Protocol):
-    """What moves the probe."""
-
-    def move(self, offset_mm: float) -> float:
-        """Go there, arrive, settle; the offset as tracked, mm."""
-        ...
-
-
 class ImageBench:
     """A bench whose response is what B-mode frames show near an expected place.
 
     Args:
-        mover: moves the probe.
+        move: moves the probe to an offset; returns the offset as tracked, mm.
         see: the next whole frame that began after the last move.
         expected_px: [u, v] where the target should be.
         within_px: look no farther from there.
@@ -61,20 +51,20 @@ class ImageBench:
 
     def __init__(
         self,
-        mover: Mover,
+        move: Callable[[float], float],
         see: Callable[[], UInt8[np.ndarray, "rows columns"]],
         expected_px: tuple[float, float],
         within_px: float,
         *,
         credible: bool = False,
     ) -> None:
-        self._mover, self._see = mover, see
+        self._move, self._see = move, see
         self._expected, self._within = expected_px, within_px
         self._credible = credible
 
     def move(self, offset_mm: float) -> float:
         """Go there, arrive, settle; returns the offset as tracked, mm."""
-        return self._mover.move(offset_mm)
+        return self._move(offset_mm)
 
     def set_threshold(self, threshold: int) -> None:
         """An image has no threshold."""
@@ -122,7 +112,7 @@ def image_scan(
     bench: ImageBench,
     settings: Settings | None = None,
     start_mm: float = 0.0,
-    watch: Callable[[float, float, int], None] | None = None,
+    watch: Watch | None = None,
 ) -> Placement:
     """Scan with the robot, fit the maximum of the intensity, go there.
 

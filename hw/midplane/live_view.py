@@ -14,14 +14,13 @@ Two operators for :func:`hw.midplane.pattern_injection.pattern_injection`: a ter
 from __future__ import annotations
 
 from collections import deque
-from contextlib import AbstractContextManager
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from hw.midplane.pattern_injection import LONGEST, Decision, View, middle_of, sides_seen
 from hw.midplane.terminal_image import Screen
 from hw.runtime.interrupts import heed_interrupt
+from hw.runtime.keys import Keyboard
 from jaxcal import InputError
 
 _LEAST_STEP_MM, _LARGEST_STEP_MM = 0.02, 1.0
@@ -101,30 +100,25 @@ def advice(view: View) -> str:
     return "The bar has shrunk on both sides: m moves the robot to the middle."
 
 
-def profile(view: View, columns: int = _PROFILE_COLUMNS) -> tuple[str, str]:
+def profile(view: View) -> tuple[str, str]:
     """The longest bar seen in each stretch of offsets, drawn as columns, and a pointer below it."""
     places = np.array([place for place, _ in view.seen])
     low, high = min(places.min(), -2.0), max(places.max(), 2.0)
-    at = np.clip(((places - low) / (high - low) * (columns - 1)).round().astype(int), 0, None)
-    heights = np.zeros(columns, int)
+    at = np.clip(
+        ((places - low) / (high - low) * (_PROFILE_COLUMNS - 1)).round().astype(int), 0, None
+    )
+    heights = np.zeros(_PROFILE_COLUMNS, int)
     np.maximum.at(heights, at, np.array([length for _, length in view.seen]))
     steps = np.ceil(heights / LONGEST * (len(_PROFILE) - 1)).astype(int)
     drawn = "".join(_PROFILE[step] for step in steps)
-    here = int(np.clip(round((view.offset_mm - low) / (high - low) * (columns - 1)), 0, columns))
+    here = int(
+        np.clip(
+            round((view.offset_mm - low) / (high - low) * (_PROFILE_COLUMNS - 1)),
+            0,
+            _PROFILE_COLUMNS,
+        )
+    )
     return f"{low:+6.1f} {drawn} {high:+.1f} mm", f"{'':7}{'':{here}}^"
-
-
-@runtime_checkable
-class KeySource(Protocol):
-    """Where keys come from (see :class:`hw.runtime.keys.Keyboard`)."""
-
-    def asking(self) -> AbstractContextManager[None]:
-        """Within it keys go to :meth:`read`; those pressed before are forgotten."""
-        ...
-
-    def read(self, timeout_s: float) -> str | None:
-        """The next key's name; None if none came in time."""
-        ...
 
 
 class TerminalOperator:
@@ -136,7 +130,7 @@ class TerminalOperator:
         screen: where to show it.
     """
 
-    def __init__(self, keys: KeySource, screen: Screen) -> None:
+    def __init__(self, keys: Keyboard, screen: Screen) -> None:
         self._source, self._screen = keys, screen
         self._keys = Keys()
 
@@ -172,13 +166,12 @@ class WindowOperator:
 
     Args:
         figure: a matplotlib figure with a canvas that takes keys; by default a new window.
-        spacing_mm: [lateral, axial] of the frames, mm per px.
 
     Raises:
         InputError: matplotlib has no display.
     """
 
-    def __init__(self, figure=None, spacing_mm: tuple[float, float] | None = None) -> None:
+    def __init__(self, figure=None) -> None:
         if figure is None:
             import matplotlib.pyplot as plt
 
@@ -190,7 +183,6 @@ class WindowOperator:
         self._image_axes, self._axes = figure.subplots(1, 2, width_ratios=(3, 2))
         self._image_axes.set(title="B-mode", xticks=[], yticks=[])
         self._axes.set(xlabel="probe's offset (mm)", ylabel="bar (lines)", ylim=(0, LONGEST + 1))
-        self._aspect = 1.0 if spacing_mm is None else spacing_mm[1] / spacing_mm[0]
         self._picture = None
         (self._line,) = self._axes.plot([], [], "o", color="0.6")
         (self._here,) = self._axes.plot([], [], "o", color="tab:red", markersize=10)
@@ -230,7 +222,7 @@ class WindowOperator:
         if frame is not None:
             if self._picture is None:
                 self._picture = self._image_axes.imshow(
-                    frame, cmap="gray", vmin=0, vmax=255, aspect=self._aspect
+                    frame, cmap="gray", vmin=0, vmax=255, aspect=1.0
                 )
             else:
                 self._picture.set_data(frame)

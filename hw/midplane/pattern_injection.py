@@ -20,7 +20,7 @@ from typing import Literal, Protocol, runtime_checkable
 import numpy as np
 
 from hw.midplane.bracket import Placement
-from hw.midplane.search import Bench, PlacementError, Settings, Walker, coarse, guarded
+from hw.midplane.search import Bench, PlacementError, Settings, Walker, Watch, coarse, procedure
 from hw.runtime.errors import DeviceError
 from jaxcal import InputError
 from jaxcal.runtime.array_types import UInt8
@@ -225,7 +225,7 @@ def pattern_injection(
     *,
     frame: Callable[[], Frame | None] = _no_frame,
     title: str = "",
-    watch: Callable[[float, float, int], None] | None = None,
+    watch: Watch | None = None,
 ) -> Placement:
     """Let an operator find the mid-plane by the injected bar.
 
@@ -248,9 +248,9 @@ def pattern_injection(
         SkippedError: by the operator.
         PlacementError: given up by a guard; the probe is at the last good place.
     """
-    settings = Settings() if settings is None else settings
 
-    def run(walker: Walker) -> Placement:
+    def search(walker: Walker, start_mm: float) -> Placement:
+        settings = walker.settings
         coarse(walker, start_mm)
         loudest, message = 0.0, ""
         heard: list[tuple[float, float]] = []
@@ -294,7 +294,7 @@ def pattern_injection(
         raise PlacementError(f"not accepted after {_MOST_LOOKS} looks")
 
     try:
-        placement = guarded(Walker(bench, settings, watch), run)
+        placement = procedure(search)(bench, settings, start_mm, watch)
     except BaseException:
         # A person must read the first error, not one of switching off.
         with contextlib.suppress(DeviceError):

@@ -12,6 +12,7 @@ placement is given up.
 from __future__ import annotations
 
 import contextlib
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
@@ -26,6 +27,10 @@ from jaxcal.runtime.array_types import Bool, Float
 _TOP_LINES = 8
 _ANSWERING_LINES = 4
 _LISTEN_AGAIN = 3
+
+
+Watch = Callable[[float, float, int], None]
+"""Told of a stop: offset (mm), amplitude (counts), threshold."""
 
 
 class PlacementError(DeviceError):
@@ -150,20 +155,35 @@ class Settings:
         return float(np.hypot(self.response_sd_mm, self.position_sd_mm))
 
 
+@runtime_checkable
+class Procedure(Protocol):
+    """A way to place the probe, made by :func:`procedure`."""
+
+    def __call__(
+        self,
+        bench: Bench,
+        settings: Settings | None = None,
+        start_mm: float = 0.0,
+        watch: Watch | None = None,
+    ) -> Placement:
+        """Place the probe."""
+        ...
+
+
 class Walker:
     """Moves and listens on behalf of one placement, and keeps its guards.
 
     Args:
         bench: what to move and listen to.
         settings: caps and steps.
-        watch: told of every stop: offset (mm), amplitude (counts), threshold.
+        watch: told of every stop.
     """
 
     def __init__(
         self,
         bench: Bench,
         settings: Settings,
-        watch: Callable[[float, float, int], None] | None = None,
+        watch: Watch | None = None,
     ) -> None:
         self._bench, self.settings, self._watch = bench, settings, watch
         self._at: float | None = None
@@ -281,17 +301,33 @@ class Walker:
         )
 
 
-def guarded(walker: Walker, run: Callable[[Walker], Placement]) -> Placement:
-    """Run a procedure; if it gives up, leave the probe at the last good place.
+def procedure(search: Callable[[Walker, float], Placement]) -> Procedure:
+    """Make a procedure of a search by a :class:`Walker`.
+
+    The procedure takes a bench, settings (None: the default ones), where the mid-plane is expected
+    (an offset from the plan's pose, mm), and what is told of every stop. Its result is a placement
+    with the probe where the search has left it.
 
     Raises:
-        PlacementError: the procedure's own. After any other error nothing is moved here.
+        PlacementError: the search's own, when it gives up: the probe is left at the last good
+            place. After any other error nothing is moved here.
     """
-    try:
-        return run(walker)
-    except PlacementError:
-        walker.leave()
-        raise
+
+    @functools.wraps(search)
+    def placed(
+        bench: Bench,
+        settings: Settings | None = None,
+        start_mm: float = 0.0,
+        watch: Watch | None = None,
+    ) -> Placement:
+        walker = Walker(bench, Settings() if settings is None else settings, watch)
+        try:
+            return search(walker, start_mm)
+        except PlacementError:
+            walker.leave()
+            raise
+
+    return placed
 
 
 def coarse(walker: Walker, start_mm: float = 0.0) -> float:
@@ -323,12 +359,8 @@ def coarse(walker: Walker, start_mm: float = 0.0) -> float:
     )
 
 
-def first_seen(
-    bench: Bench,
-    settings: Settings | None = None,
-    start_mm: float = 0.0,
-    watch: Callable[[float, float, int], None] | None = None,
-) -> Placement:
+@procedure
+def first_seen(walker: Walker, start_mm: float) -> Placement:
     """No placement: stop as soon as the element is heard, as conventional practice would.
 
     Returns:
@@ -337,17 +369,7 @@ def first_seen(
     Raises:
         PlacementError: it is heard nowhere.
     """
-    settings = Settings() if settings is None else settings
-
-    def run(walker: Walker) -> Placement:
-        offset = coarse(walker, start_mm)
-        half = settings.beam_half_mm
-        return walker.placement(
-            "first-seen",
-            offset,
-            (offset - half, offset + half),
-            half / np.sqrt(3.0),
-            walker.samples[-1][1],
-        )
-
-    return guarded(Walker(bench, settings, watch), run)
+    offset = coarse(walker, start_mm)
+    half, amplitude = walker.settings.beam_half_mm, walker.samples[-1][1]
+    edges = (offset - half, offset + half)
+    return walker.placement("first-seen", offset, edges, half / np.sqrt(3.0), amplitude)

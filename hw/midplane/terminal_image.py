@@ -7,7 +7,8 @@ import shutil
 import textwrap
 import threading
 from collections.abc import Sequence
-from typing import Protocol, runtime_checkable
+from io import TextIOBase
+from typing import TextIO
 
 import numpy as np
 
@@ -55,23 +56,6 @@ def _fitting(row: str, columns: int) -> list[str]:
     return textwrap.wrap(row, max(columns - 1, 1))
 
 
-@runtime_checkable
-class Stream(Protocol):
-    """What is written to."""
-
-    def write(self, text: str, /) -> int:
-        """Write."""
-        ...
-
-    def flush(self) -> None:
-        """Write what waits."""
-        ...
-
-    def isatty(self) -> bool:
-        """Whether a person looks at it."""
-        ...
-
-
 class Screen:
     """Lines of text on a terminal, below which a block is painted over itself.
 
@@ -80,7 +64,7 @@ class Screen:
         terminal: whether it understands cursor movements; by default whether it is a terminal.
     """
 
-    def __init__(self, stream: Stream, terminal: bool | None = None) -> None:
+    def __init__(self, stream: TextIO | TextIOBase, terminal: bool | None = None) -> None:
         self._stream = stream
         if terminal is None:
             terminal = stream.isatty() and os.environ.get("TERM", "dumb") != "dumb"
@@ -94,7 +78,7 @@ class Screen:
     def size(self) -> tuple[int, int]:
         """Columns and lines; 80 and 24 for a terminal that does not tell."""
         try:
-            number = self._stream.fileno()  # pyright: ignore[reportAttributeAccessIssue]
+            number = self._stream.fileno()
             columns, lines = os.get_terminal_size(number)
         except (AttributeError, OSError, ValueError):
             columns, lines = shutil.get_terminal_size()

@@ -9,14 +9,13 @@ The middle must agree with the fine scan's maximum (procedure 1).
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from hw.midplane.amplitude_scan import Peak, scan_up
 from hw.midplane.bracket import Placement
-from hw.midplane.search import Bench, PlacementError, Settings, Walker, coarse, guarded
+from hw.midplane.search import PlacementError, Settings, Walker, coarse, procedure
 
 _FIRST_FRACTION = 0.75
 _MOST_ROUNDS = 8
@@ -124,49 +123,38 @@ def climb(walker: Walker, peak: Peak) -> Edges:
     return best
 
 
-def threshold_climb(
-    bench: Bench,
-    settings: Settings | None = None,
-    start_mm: float = 0.0,
-    watch: Callable[[float, float, int], None] | None = None,
-) -> Placement:
+@procedure
+def threshold_climb(walker: Walker, start_mm: float) -> Placement:
     """Coarse raster, fine scan, threshold climb; the probe ends half way between the loss edges.
-
-    Arguments are those of :func:`hw.midplane.amplitude_scan.amplitude_scan`.
 
     Returns:
         A placement whose bracket holds the last stretch, widened by the errors that no search sees.
 
     Raises:
-        PlacementError: given up, or the climb and the fine scan contradict each other; the probe is
-            at the last good place.
+        PlacementError: given up, or the climb and the fine scan contradict each other.
     """
-    settings = Settings() if settings is None else settings
-
-    def run(walker: Walker) -> Placement:
-        peak = scan_up(walker, coarse(walker, start_mm), 2 * settings.fine_mm)
-        edges = climb(walker, peak)
-        if _apart(edges, peak, settings):
-            walker.notes.append("climb and loudest place disagreed; scanned and climbed once more")
-            walker.set_threshold(settings.low_threshold)
-            peak = scan_up(walker, peak.place_mm - settings.coarse_mm, settings.fine_mm)
-            edges = climb(walker, peak)
-        apart = _apart(edges, peak, settings)
-        if apart:
-            raise PlacementError(
-                f"the threshold climb ends {apart:+.2f} mm from the place of the largest "
-                "amplitude: the beam is asymmetric, or the target moved"
-            )
+    settings = walker.settings
+    peak = scan_up(walker, coarse(walker, start_mm), 2 * settings.fine_mm)
+    edges = climb(walker, peak)
+    if _apart(edges, peak, settings):
+        walker.notes.append("climb and loudest place disagreed; scanned and climbed once more")
         walker.set_threshold(settings.low_threshold)
-        where, echoes = walker.stop_at(edges.middle_mm)
-        if not echoes.heard:
-            walker.recover()
-            raise PlacementError("the response was lost at the place that the climb found")
-        return walker.placement(
-            "threshold-climb", where, (edges.low_mm, edges.high_mm), edges.sd_mm, echoes.peak
+        peak = scan_up(walker, peak.place_mm - settings.coarse_mm, settings.fine_mm)
+        edges = climb(walker, peak)
+    apart = _apart(edges, peak, settings)
+    if apart:
+        raise PlacementError(
+            f"the threshold climb ends {apart:+.2f} mm from the place of the largest amplitude: "
+            "the beam is asymmetric, or the target moved"
         )
-
-    return guarded(Walker(bench, settings, watch), run)
+    walker.set_threshold(settings.low_threshold)
+    where, echoes = walker.stop_at(edges.middle_mm)
+    if not echoes.heard:
+        walker.recover()
+        raise PlacementError("the response was lost at the place that the climb found")
+    return walker.placement(
+        "threshold-climb", where, (edges.low_mm, edges.high_mm), edges.sd_mm, echoes.peak
+    )
 
 
 def _apart(edges: Edges, peak: Peak, settings: Settings) -> float:

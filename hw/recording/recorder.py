@@ -12,13 +12,12 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
+import pickle
 import threading
 import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
@@ -26,10 +25,9 @@ import numpy as np
 from hw.recording.check import check_resumable
 from hw.recording.file import utc_now
 from hw.recording.layout import TEXT_BYTES, RecordingHeader
-from hw.robot.pose import ur_to_pose
-from hw.runtime.pipes import encode
+from hw.runtime.processes import finish, spawn
+from hw.runtime.rigid import ur_to_pose
 from jaxcal import CalibrationError, FormatError, OutputError
-from jaxcal.runtime.isolated import python_command
 
 if TYPE_CHECKING:
     from hw.active_echo.device import EchoFrame
@@ -76,7 +74,7 @@ class Recorder:
         """Rows of continuous data that found the queue full, by group."""
         self._capacity, self._patience = queue_bytes, patience_s
         self._time_offset = time_offset_s
-        self._queue: deque[tuple[bytes, ...]] = deque()
+        self._queue: deque[bytes] = deque()
         self._waiting = 0
         self._changed = threading.Condition()
         self._answers: dict[str, Any] = {}
@@ -87,12 +85,7 @@ class Recorder:
         self._ending = self._ended = False
         self._marks = 0
         # In a session of its own: Ctrl-C, or a signal to the whole group, must not stop the writer.
-        self._process = subprocess.Popen(
-            python_command("hw.recording.writer_process", self.path),
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            start_new_session=True,
-        )
+        self._process = spawn("hw.recording.writer_process", self.path, stdin=True, stderr=None)
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._listener = threading.Thread(
@@ -103,7 +96,7 @@ class Recorder:
         )
         self._listener.start()
         self._feeder.start()
-        self._put({"do": "open", "header": None if header is None else asdict(header)})
+        self._put({"do": "open", "header": header})
         try:
             self.rows: dict[str, int] = self._answer("open", _ENDING_S)["rows"]
             """Rows of every group when the file was opened; a resumed file holds some already."""
@@ -357,8 +350,8 @@ class Recorder:
         for name in ("t_host", "time"):
             if name in columns:
                 columns[name] = columns[name] + self._time_offset
-        parts = encode(message, columns)
-        size = sum(map(len, parts))
+        data = pickle.dumps((message, columns))
+        size = len(data)
         deadline = time.monotonic() + self._patience
         with self._changed:
             while self._waiting and self._waiting + size > self._capacity:
@@ -370,7 +363,7 @@ class Recorder:
                         f"{self.path}: the disk took no data for {self._patience:g} s"
                     )
             self._raise_error()
-            self._queue.append(parts)
+            self._queue.append(data)
             self._waiting += size
             self._changed.notify_all()
         return True
@@ -399,11 +392,7 @@ class Recorder:
             self._ending = self._ended = True
             self._changed.notify_all()
         self._feeder.join(_ENDING_S)
-        try:
-            self._process.wait(_ENDING_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        if not finish(self._process, _ENDING_S):
             self._fail(OutputError(f"{self.path}: the writer did not end and was stopped"))
         self._listener.join(_ENDING_S)
         if self._process.stdout is not None:
@@ -417,12 +406,11 @@ class Recorder:
                         if self._ending:
                             return
                         self._changed.wait()
-                    parts = self._queue.popleft()
-                for part in parts:
-                    pipe.write(part)
+                    data = self._queue.popleft()
+                pipe.write(data)
                 pipe.flush()
                 with self._changed:
-                    self._waiting -= sum(map(len, parts))
+                    self._waiting -= len(data)
                     self._changed.notify_all()
         except OSError:
             # The writer is gone; the listener knows why.

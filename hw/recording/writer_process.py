@@ -9,21 +9,23 @@ from __future__ import annotations
 
 import json
 import os
-import select
+import pickle
+import queue
 import signal
 import sys
+import threading
 import time
+from collections.abc import Callable
 from contextlib import suppress
-from io import RawIOBase
 from typing import Any
 
 from hw.recording.file import RecordingWriter
-from hw.recording.layout import RecordingHeader
-from hw.runtime.pipes import read_message
 from jaxcal import CalibrationError
 from jaxcal.io.given_files import one_line
 
 FLUSH_S = 1.0
+_MOST_WAITING = 4
+"""Messages that wait here, and not in the queue of the acquisition, which is bounded in bytes."""
 
 
 def main(path: str) -> int:
@@ -44,17 +46,18 @@ def main(path: str) -> int:
     sys.unraisablehook = lambda _: None
     writer = None
     try:
-        with os.fdopen(os.dup(0), "rb", buffering=0) as source:
-            first = read_message(source)
-            if first is None:
-                return 0
-            given = first[0]["header"]
-            if given is None:
-                writer = RecordingWriter.resume(path)
-            else:
-                writer = RecordingWriter.create(path, RecordingHeader(**given))
-            answer(mark="open", rows=writer.rows)
-            _serve(writer, source, answer)
+        messages: queue.Queue[tuple[dict, dict] | None] = queue.Queue(_MOST_WAITING)
+        threading.Thread(target=_receive, args=(messages,), daemon=True).start()
+        first = messages.get()
+        if first is None:
+            return 0
+        header = first[0]["header"]
+        if header is None:
+            writer = RecordingWriter.resume(path)
+        else:
+            writer = RecordingWriter.create(path, header)
+        answer(mark="open", rows=writer.rows)
+        _serve(writer, messages, answer)
         writer.close()
     except Exception as error:
         known = isinstance(error, CalibrationError)
@@ -70,21 +73,33 @@ def main(path: str) -> int:
     return 0
 
 
-def _serve(writer: RecordingWriter, source: RawIOBase, answer) -> None:
+def _receive(messages: queue.Queue) -> None:
+    """In a thread of its own: messages from standard input; None at its end, also within one."""
+    # Not sys.stdin, whose lock a thread must not hold when Python ends.
+    source = os.fdopen(os.dup(0), "rb")
+    with suppress(EOFError, pickle.UnpicklingError):
+        while True:
+            messages.put(pickle.load(source))
+    messages.put(None)
+
+
+def _serve(writer: RecordingWriter, messages: queue.Queue, answer: Callable[..., None]) -> None:
     """Handle messages until the pipe ends or the recording is finished."""
     # Time by which the file on the disk must be flushed; None while it is up to date.
     due: float | None = None
     while True:
         left = None if due is None else max(due - time.monotonic(), 0.0)
-        waiting = select.select([source], [], [], left)[0]
+        try:
+            received = messages.get(timeout=left)
+        except queue.Empty:
+            received = ()
         if due is not None and time.monotonic() >= due:
             writer.flush()
             due = None
-        if not waiting:
-            continue
-        received = read_message(source)
         if received is None:
             return
+        if not received:
+            continue
         message, columns = received
         due = time.monotonic() + FLUSH_S if due is None else due
         match message["do"]:

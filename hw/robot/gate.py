@@ -20,11 +20,11 @@ from hw.robot.feasibility import check_model, follow, follow_all
 from hw.robot.limits import Limits, numbers
 from hw.robot.motion_plan import MotionPlan
 from hw.robot.path_checks import check_path, checked_pose, pace, within_search
-from hw.robot.pose import pose_to_ur
 from hw.robot.rtde import PendantSettings, state_text
 from hw.robot.stream import PoseSample, offset_changed
 from hw.runtime.clock import Clock
 from hw.runtime.errors import StaleError, refused
+from hw.runtime.rigid import pose_to_ur
 
 _LEAST_SPEED_MM_S = 0.01
 """A slower move is a mistake of units; at 0.01 mm/s a search step of 0.05 mm takes 5 s."""

@@ -34,7 +34,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-from hw.robot._process import spawn
 from hw.robot.confirmation import Confirmation
 from hw.robot.motion_plan import MotionPlan
 from hw.robot.mover.messages import Setup, error_of, line_of, sample_of, told
@@ -43,6 +42,7 @@ from hw.robot.stream import PoseSample
 from hw.runtime.clock import REAL, Clock
 from hw.runtime.errors import DeviceError, LostError, StaleError, StoppedError, refused
 from hw.runtime.interrupts import heed_interrupt
+from hw.runtime.processes import finish, spawn
 
 Log = Callable[[float, str, dict[str, object]], None]
 """Takes bench time (s), the command, and its numbers."""
@@ -357,12 +357,8 @@ class Motion:
     def _kill(self, error: DeviceError) -> None:
         self._ended = self._ended or error
         assert self._process is not None
-        with contextlib.suppress(ProcessLookupError):
-            self._process.kill()
-        self._process.wait()
-        with contextlib.suppress(OSError):
-            assert self._process.stdin is not None
-            self._process.stdin.close()
+        self._process.kill()
+        finish(self._process, None)
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join()
 

@@ -51,32 +51,12 @@ class MotionPlan:
         object.__setattr__(self, "tcp_offset", numbers(self.tcp_offset, 6, "tcp_offset"))
         if self.joints is not None:
             object.__setattr__(self, "joints", numbers(self.joints, 6, "joints"))
-        if not 1 <= len(self.serial) <= 100:
+        if not isinstance(self.serial, str) or not 1 <= len(self.serial) <= 100:
             raise refused("the plan does not say which robot it is for")
         if not self.pendant.speed_fraction > 0:
             raise refused(
                 "the speed slider is at 0 %, so the robot would not move: raise it at the pendant"
             )
-
-    @classmethod
-    def from_poses(
-        cls,
-        poses: object,
-        limits: Limits,
-        tcp_offset: object,
-        serial: object,
-        pendant: PendantSettings | None = None,
-    ) -> MotionPlan:
-        """A plan from another program's data; anything that is not a plan is refused.
-
-        Raises:
-            RefusedError: not poses, not an offset, or no robot.
-        """
-        if not isinstance(serial, str):
-            raise refused("the plan does not say which robot it is for")
-        targets = array_of(poses, "the plan's poses")
-        offset = numbers(tcp_offset, 6, "tcp_offset")
-        return cls(targets, limits, offset, serial, pendant=pendant or PendantSettings())
 
     @property
     def identified(self) -> bool:

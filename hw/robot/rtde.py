@@ -244,6 +244,8 @@ class PacketReader:
     ) -> None:
         self.host = host
         self._data = bytearray()
+        self._kept: list[bytes] = []
+        """The packet that came while connecting."""
         self._pendant = PendantSettings()
         try:
             self._socket = socket.create_connection((host, PORT), timeout=timeout_s)
@@ -280,7 +282,9 @@ class PacketReader:
         now = time.monotonic()
         if data:
             self._data += data
-        packets = [self._packet(now, payload) for kind, payload in self._messages() if kind == b"U"]
+        payloads, self._kept = self._kept, []
+        payloads += [payload for kind, payload in self._messages() if kind == b"U"]
+        packets = [self._packet(now, payload) for payload in payloads]
         if data == b"" and not packets:
             raise LostError("the controller closed the connection", device="robot")
         return packets
@@ -383,7 +387,8 @@ class PacketReader:
             The attributes ``bound`` and ``latency_s``.
         """
         period = 1.0 / self.frequency_hz
-        best, above = (-math.inf, 0.0), math.inf
+        bounds: list[tuple[float, float]] = []
+        best, latency, above = (math.inf, 0.0), 0.0, math.inf
         give_up = time.monotonic() + _BOUND_WITHIN_S
         for attempt in range(_BOUND_TRIES):
             if attempt >= _LEAST_TRIES and time.monotonic() > give_up:
@@ -391,49 +396,24 @@ class PacketReader:
             if attempt:
                 # Packets sent before the answer to this request to pause are read and dropped.
                 self._ask(b"P", b"", deadline)
+                self._kept.clear()
             asked = time.monotonic()
             if self._ask(b"S", b"", deadline)[:1] != b"\x01":
                 raise refused("the controller would not start sending")
-            packet = self._first(deadline)
-            if packet is None:
+            try:
+                self._kept = [self._wait_for(b"U", deadline)]
+            except TimeoutError:
                 # The controller accepts but sends nothing: whoever reads will notice.
                 break
+            packet = self._packet(time.monotonic(), self._kept[0])
             stamp = packet.timestamp_s
             above = min(above, packet.monotonic_s - stamp)
-            best = max(best, (asked - period, stamp), key=lambda pair: pair[0] - pair[1])
-            if above - (best[0] - best[1]) < _BOUND_S + 3 * period:
+            bounds.append((asked - period, stamp))
+            best = max(bounds, key=lambda pair: pair[0] - pair[1])
+            latency = max(above - (best[0] - best[1]), 0.0)
+            if latency < _BOUND_S + 3 * period:
                 break
-        return best, max(above - (best[0] - best[1]), 0.0) if math.isfinite(above) else 0.0
-
-    def _first(self, deadline: float) -> Packet | None:
-        """The first packet after a start, kept for :meth:`read`; None if none or a bad one came."""
-        while True:
-            data = bytes(self._data)
-            if len(data) >= 3:
-                (size,) = struct.unpack_from(">H", data)
-                if size < 3:
-                    raise LostError("what was received is not RTDE data", device="robot")
-                if len(data) >= size:
-                    if data[2:3] == b"U":
-                        # If it is bad, :meth:`read` will say what is wrong with it.
-                        with contextlib.suppress(LostError):
-                            return self._packet(time.monotonic(), data[3:size])
-                        return None
-                    del self._data[:size]
-                    continue
-            left = deadline - time.monotonic()
-            if left <= 0:
-                return None
-            self._socket.settimeout(left)
-            try:
-                new = self._socket.recv(65536)
-            except TimeoutError:
-                return None
-            except OSError as error:
-                raise LostError(f"the connection broke: {error}", device="robot") from error
-            if not new:
-                raise LostError("the controller closed the connection", device="robot")
-            self._data += new
+        return best, latency
 
     def _recipe(self, names: list[str], deadline: float) -> list[str]:
         payload = struct.pack(">d", self.frequency_hz) + ",".join(names).encode()
@@ -442,20 +422,34 @@ class PacketReader:
     def _ask(self, kind: bytes, payload: bytes, deadline: float) -> bytes:
         try:
             self._socket.sendall(struct.pack(">H", 3 + len(payload)) + kind + payload)
-            while True:
-                with contextlib.closing(self._messages()) as messages:
-                    for answer_kind, answer in messages:
-                        if answer_kind == kind:
-                            return answer
-                left = deadline - time.monotonic()
-                if left <= 0:
-                    raise TimeoutError
-                self._socket.settimeout(left)
-                data = self._socket.recv(65536)
-                if not data:
-                    raise LostError("the controller closed the connection", device="robot")
-                self._data += data
+            return self._wait_for(kind, deadline)
         except TimeoutError:
             raise LostError(f"{self.host} accepted but does not answer", device="robot") from None
         except OSError as error:
             raise LostError(f"the connection broke: {error}", device="robot") from error
+
+    def _wait_for(self, kind: bytes, deadline: float) -> bytes:
+        """Payload of the next message of a kind; those before it are dropped.
+
+        Raises:
+            TimeoutError: it did not come in time.
+            LostError: the connection is gone.
+        """
+        while True:
+            with contextlib.closing(self._messages()) as messages:
+                for came, payload in messages:
+                    if came == kind:
+                        return payload
+            left = deadline - time.monotonic()
+            if left <= 0:
+                raise TimeoutError
+            self._socket.settimeout(left)
+            try:
+                data = self._socket.recv(65536)
+            except TimeoutError:
+                raise
+            except OSError as error:
+                raise LostError(f"the connection broke: {error}", device="robot") from error
+            if not data:
+                raise LostError("the controller closed the connection", device="robot")
+            self._data += data

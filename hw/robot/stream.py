@@ -9,10 +9,7 @@ latency that was there from the start counts too.
 
 from __future__ import annotations
 
-import contextlib
-import math
-import os
-import struct
+import pickle
 import subprocess
 import threading
 import time
@@ -20,18 +17,16 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import IO, Any
 
 import numpy as np
 
-from hw.robot._process import spawn
-from hw.robot._reader import BOUND, ERROR, POSE, RECORD
 from hw.robot.identity import Identity, read_identity
-from hw.robot.pose import ur_to_pose
-from hw.robot.rtde import PendantSettings, too_late
+from hw.robot.rtde import Packet, PendantSettings, too_late
 from hw.runtime.clock import REAL, Clock, Lag
-from hw.runtime.errors import LostError, StaleError, refused
-from hw.runtime.rigid import rotation_vector
+from hw.runtime.errors import DeviceError, LostError, StaleError, refused
+from hw.runtime.processes import spawn
+from hw.runtime.rigid import rotation_vector, ur_to_pose
 from jaxcal.runtime.array_types import Float
 
 _OFFSET_TOLERANCE = 1e-6
@@ -56,6 +51,21 @@ class PoseSample:
     """Upper bound of how long it was on its way, bench s (:class:`Lag`)."""
     joints: tuple[float, ...] | None = None
     """(6,) rad; None where they were not read from the controller."""
+
+    @classmethod
+    def of(cls, packet: Packet, clock: Clock, lag: Lag) -> PoseSample:
+        """The pose in a packet."""
+        t_host = clock.at(packet.monotonic_s)
+        return cls(
+            t_host,
+            packet.timestamp_s,
+            packet.tcp_pose,
+            packet.safety_bits,
+            packet.robot_mode,
+            packet.runtime_state,
+            lag.of(t_host, packet.timestamp_s),
+            packet.joints,
+        )
 
     @cached_property
     def pose(self) -> Float[np.ndarray, "4 4"]:
@@ -93,8 +103,6 @@ class PoseStream:
         clock: bench time.
         frequency_hz: poses per second; by default all the controller makes.
         max_age_s: bench seconds after which :meth:`latest` refuses a pose.
-        client: ``packets`` reads every packet; ``ur_rtde`` goes through that library, which keeps
-            only the newest and so loses some on a busy machine.
         timeout_s: wall seconds for the connection, and of silence before it counts as lost.
     """
 
@@ -105,7 +113,6 @@ class PoseStream:
         clock: Clock = REAL,
         frequency_hz: float | None = None,
         max_age_s: float = 0.1,
-        client: Literal["packets", "ur_rtde"] = "packets",
         timeout_s: float = 3.0,
     ) -> None:
         self.host, self.clock, self.max_age_s = host, clock, max_age_s
@@ -117,7 +124,7 @@ class PoseStream:
         """[m, rad] of the tool centre point in the flange's frame; None where it is not sent."""
         self.pendant: PendantSettings | None = None
         """The newest settings; None until the controller has sent them."""
-        self._client, self._frequency, self._timeout = client, frequency_hz, timeout_s
+        self._frequency, self._timeout = frequency_hz, timeout_s
         self._samples: deque[PoseSample] = deque(maxlen=_MOST_POSES)
         self._latest: PoseSample | None = None
         self._listeners: list[list[PoseSample]] = []
@@ -140,7 +147,6 @@ class PoseStream:
         self._process = spawn(
             "hw.robot._reader",
             self.host,
-            self._client,
             str(self._frequency or 0.0),
             str(self._timeout),
         )
@@ -159,8 +165,7 @@ class PoseStream:
     def close(self) -> None:
         """End the process; poses already read can still be drained."""
         if self._process is not None:
-            with contextlib.suppress(ProcessLookupError):
-                self._process.kill()
+            self._process.kill()
             self._process.wait()
         if self._thread is not None:
             self._thread.join()
@@ -240,76 +245,49 @@ class PoseStream:
     def _receive(self) -> None:
         assert self._process is not None
         assert self._process.stdout is not None
-        output = self._process.stdout
-        data = b""
-        error = None
+        error = "the process that reads poses ended"
         try:
-            while error is None:
-                new = os.read(output.fileno(), 1 << 18)
-                if not new:
-                    error = "the process that reads poses ended"
-                    break
-                data, error = self._take(data + new)
-        except OSError as problem:
-            error = f"the process that reads poses: {problem}"
+            with self._process.stdout as told:
+                bound, latency_s = self._next(told)
+                self._lag = Lag(self.clock.at(bound[0]), bound[1])
+                problem = too_late(latency_s * self.clock.speed, self.max_age_s)
+                if problem is not None:
+                    raise problem
+                while True:
+                    self._take(self._next(told))
+        except DeviceError as problem:
+            error = problem.args[0]
+        except (EOFError, OSError, pickle.UnpicklingError):
+            pass
         finally:
-            output.close()
             with self._condition:
                 self._error = error
                 self._condition.notify_all()
 
-    def _take(self, data: bytes) -> tuple[bytes, str | None]:
-        start, size = 0, RECORD.size
-        if data[:1] == BOUND and len(data) >= 25:
-            monotonic_s, t_device, latency_s = struct.unpack_from("<3d", data, 1)
-            self._lag = Lag(self.clock.at(monotonic_s), t_device)
-            start = 25
-            problem = too_late(latency_s * self.clock.speed, self.max_age_s)
-            if problem is not None:
-                return b"", problem.args[0]
-        new: list[PoseSample] = []
-        error = None
-        told = ()
-        while len(data) - start >= 1 + size and data[start : start + 1] == POSE:
-            record = RECORD.unpack_from(data, start + 1)
-            start += 1 + size
-            t_host, t_device = self.clock.at(record[0]), record[1]
-            lag = self._lag.of(t_host, t_device)
-            joints = None if math.isnan(record[22]) else record[22:28]
-            bits, robot_mode, runtime_state = record[8:11]
-            new.append(
-                PoseSample(
-                    t_host, t_device, record[2:8], bits, robot_mode, runtime_state, lag, joints
-                )
-            )
-            if not math.isnan(record[11]):
-                self._compare(record[11:17])
-            if record[17:22] != told:
-                told = record[17:22]
-                self._keep_pendant(*told)
-        if data[start : start + 1] == ERROR and len(data) - start >= 3:
-            (length,) = struct.unpack_from("<H", data, start + 1)
-            if len(data) - start >= 3 + length:
-                error = data[start + 3 : start + 3 + length].decode("utf-8", "replace")
-        if new:
-            with self._condition:
-                room = (self._samples.maxlen or 0) - len(self._samples)
-                self.dropped += max(0, len(new) - room)
-                self._samples.extend(new)
-                for listener in self._listeners:
-                    listener.extend(new)
-                self.received += len(new)
-                self._latest = new[-1]
-                self._condition.notify_all()
-        return data[start:], error
+    def _next(self, told: IO[bytes]) -> Any:
+        """What the process writes next (:mod:`hw.robot._reader`); raises the error that ends it."""
+        item = pickle.load(told)
+        if isinstance(item, DeviceError):
+            raise item
+        return item
 
-    def _keep_pendant(self, payload: float, x: float, y: float, z: float, speed: float) -> None:
-        if not math.isnan(speed):
-            self.pendant = PendantSettings(
-                None if math.isnan(payload) else payload,
-                None if math.isnan(x) else (x, y, z),
-                speed,
-            )
+    def _take(self, packets: list[Packet]) -> None:
+        new = [PoseSample.of(packet, self.clock, self._lag) for packet in packets]
+        for packet in packets:
+            self.pendant = packet.pendant
+            if packet.tcp_offset is not None:
+                self._compare(packet.tcp_offset)
+        if not new:
+            return
+        with self._condition:
+            room = (self._samples.maxlen or 0) - len(self._samples)
+            self.dropped += max(0, len(new) - room)
+            self._samples.extend(new)
+            for listener in self._listeners:
+                listener.extend(new)
+            self.received += len(new)
+            self._latest = new[-1]
+            self._condition.notify_all()
 
     def _compare(self, offset: tuple[float, ...]) -> None:
         if self.tcp_offset is None:

@@ -1,1 +1,1 @@
-"""What all of hw uses: errors, bench time, keys, signals, optional libraries, rigid transforms."""
+"""What all of hw uses: errors, bench time, keys, signals, processes, libraries, transforms."""

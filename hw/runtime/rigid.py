@@ -97,3 +97,30 @@ def straight_way(
     way = rigid(parts * turn, start[:3, 3] + parts * (goal[:3, 3] - start[:3, 3]))
     way[:, :3, :3] = way[:, :3, :3] @ start[:3, :3]
     return way
+
+
+def ur_to_pose(raw: Float[np.ndarray, "*batch 6"]) -> Float[np.ndarray, "*batch 4 4"]:
+    """Poses as a Universal Robots controller gives them -> 4x4 transforms.
+
+    Args:
+        raw: (..., 6) position (m) and rotation vector (rad) of a frame in the robot's base frame.
+
+    Returns:
+        (..., 4, 4), mm: the frame -> robot base.
+    """
+    raw = np.asarray(raw, dtype=np.float64)
+    return rigid(raw[..., 3:], raw[..., :3] * 1000.0)
+
+
+def pose_to_ur(pose: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 6"]:
+    """4x4 transforms (mm) -> poses as a Universal Robots controller takes them.
+
+    Args:
+        pose: (..., 4, 4), mm; rotation blocks must be orthonormal.
+
+    Returns:
+        (..., 6) metres and a rotation vector of at most pi rad.
+    """
+    pose = np.asarray(pose, dtype=np.float64)
+    position = pose[..., :3, 3] / 1000.0
+    return np.concatenate([position, rotation_vector(pose[..., :3, :3])], axis=-1)

@@ -1,8 +1,6 @@
-"""The emulated bench as a setup, in place of a lab's TOML file, and as an oracle of the truth."""
+"""The emulated bench as a setup, in place of a lab's TOML file."""
 
 from __future__ import annotations
-
-import numpy as np
 
 from hw.bench.run import Bench, BenchOptions, start_bench
 from hw.setup.description import Setup
@@ -64,23 +62,3 @@ def setup_of(bench: Bench) -> Setup:
             "search_deg": 0.5,
         },
     )
-
-
-class BenchOracle:
-    """The truth of an emulated bench (see :class:`hw.acquisition.acquire.Oracle`)."""
-
-    def __init__(self, bench: Bench) -> None:
-        self._bench = bench
-
-    def elevation_mm(self) -> float:
-        """The target's true elevational offset, now."""
-        return float(self._bench.truth(self._bench.true_pose())[2])
-
-    def truth(self) -> tuple[np.ndarray, np.ndarray]:
-        """The true X (4, 4) and target (3,), mm."""
-        world = self._bench.world_truth()
-        return world["image_to_probe"], world["point_mm"]
-
-    def test_set(self) -> tuple[np.ndarray, np.ndarray]:
-        """Noise-free test images: poses and [lateral, range], mm."""
-        return self._bench.test_set()

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass
 
 from fastcrc import crc64
 
@@ -31,30 +30,18 @@ _BEGIN = re.compile(rb"\x00[\x01\x02][A-Z0-9_]")
 _CHECKS_PER_BYTE = 4
 
 
-@dataclass
-class FramingCounts:
-    """What a decoder has seen.
-
-    Attributes:
-        messages: accepted.
-        crc_errors: bodies whose CRC was wrong.
-        broken_headers: how often there was no header where one had to be.
-        unsupported: intact messages with content that is not read here.
-        resynchronised: how often a message was accepted after something broken.
-    """
-
-    messages: int = 0
-    crc_errors: int = 0
-    broken_headers: int = 0
-    unsupported: int = 0
-    resynchronised: int = 0
-
-
 class MessageDecoder:
     """Incremental decoder; never waits, and never raises on what it is fed.
 
     It holds at most one message and what came with it: bodies are bounded by
     :data:`~jaxcal.io.openigtlink.MAXIMUM_BODY`, and nothing is allocated before it arrives.
+
+    Attributes:
+        crc_errors: bodies whose CRC was wrong.
+        broken_headers: how often there was no header where one had to be.
+        unsupported: intact messages with content that is not read here.
+        reason: why the last of these was not read.
+        resynchronised: how often a message was accepted after something broken.
     """
 
     def __init__(self) -> None:
@@ -66,7 +53,7 @@ class MessageDecoder:
         self._hunting = False
         self._damaged = False
         self._budget = 0
-        self.counts = FramingCounts()
+        self.crc_errors = self.broken_headers = self.unsupported = self.resynchronised = 0
         self.reason = ""
 
     @property
@@ -112,7 +99,7 @@ class MessageDecoder:
                 self._accept(self._header, body, found)
                 self._drop(end)
                 return True
-            self.counts.crc_errors += 1
+            self.crc_errors += 1
             self._wrong_crc = self._damaged = True
         # The bytes that follow show whether the size can be trusted.
         if len(self._buffer) < end + HEADER_SIZE:
@@ -141,21 +128,19 @@ class MessageDecoder:
 
     def _accept(self, header: Header, body: bytes, found: list[Message]) -> None:
         if self._damaged:
-            self.counts.resynchronised += 1
+            self.resynchronised += 1
             self._damaged = False
         try:
             found.append(decode_body(header, body, self._began))
         except ContentError as error:
-            self.counts.unsupported += 1
+            self.unsupported += 1
             self.reason = f"{header.device}: {error}"
-            return
-        self.counts.messages += 1
 
     def _hunt(self) -> bool:
         """Drop bytes up to the next place where a header may begin."""
         if not self._hunting:
             self._hunting = self._damaged = True
-            self.counts.broken_headers += 1
+            self.broken_headers += 1
         # If fewer bytes than a header are left, they may be the beginning of one.
         last = len(self._buffer) - HEADER_SIZE
         place = 1

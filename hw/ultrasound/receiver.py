@@ -145,9 +145,7 @@ class UltrasoundStream:
         self._decoder = MessageDecoder()
         self._changed = threading.Condition()
         self._images: deque[Image] = deque()
-        self._bytes = 0
         self._transforms: deque[Transform] = deque(maxlen=4096)
-        self._status: StatusMessage | None = None
         self._counts = UltrasoundStatistics()
         self._last: dict[str, tuple[int, float, Lag]] = {}
         self._other_devices: set[str] = set()
@@ -210,9 +208,7 @@ class UltrasoundStream:
                 lambda: self._images or self._failure, self._clock.wall(timeout_s)
             )
             if self._images:
-                image = self._images.popleft()
-                self._bytes -= image.array.nbytes
-                return image
+                return self._images.popleft()
             if self._failure is not None:
                 raise self._failure
         raise StaleError(
@@ -229,7 +225,6 @@ class UltrasoundStream:
         with self._changed:
             images = list(self._images)
             self._images.clear()
-            self._bytes = 0
             if not images and self._failure is not None:
                 raise self._failure
         return images
@@ -241,20 +236,16 @@ class UltrasoundStream:
             self._transforms.clear()
         return transforms
 
-    def status(self) -> StatusMessage | None:
-        """The last status that the server sent."""
-        return self._status
-
     def statistics(self) -> UltrasoundStatistics:
         """Counts since the connection was made."""
         with self._changed:
-            counts = self._decoder.counts
+            decoder = self._decoder
             return replace(
                 self._counts,
-                crc_errors=counts.crc_errors,
-                resynchronised=counts.resynchronised,
-                unsupported=counts.unsupported,
-                reason=self._decoder.reason,
+                crc_errors=decoder.crc_errors,
+                resynchronised=decoder.resynchronised,
+                unsupported=decoder.unsupported,
+                reason=decoder.reason,
                 other_devices=tuple(sorted(self._other_devices)),
             )
 
@@ -299,7 +290,7 @@ class UltrasoundStream:
                     self._take_transform(message, tracked)
                 self._take_image(message, message.content.picture)
             case StatusMessage():
-                self._status = message.content
+                pass
             case content:
                 self._counts.other += 1
                 # A peer may invent devices without end.
@@ -330,11 +321,10 @@ class UltrasoundStream:
             late_s=late_s if math.isfinite(late_s) else 0.0,
         )
         self._images.append(image)
-        self._bytes += image.array.nbytes
         while len(self._images) > self._capacity or (
-            self._bytes > _QUEUE_BYTES and len(self._images) > 1
+            len(self._images) > 1 and sum(i.array.nbytes for i in self._images) > _QUEUE_BYTES
         ):
-            self._bytes -= self._images.popleft().array.nbytes
+            self._images.popleft()
             counts.dropped += 1
 
     def _remember(self, message: Message, lag: Lag) -> None:

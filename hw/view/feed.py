@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import json
 import os
+import pickle
 import select
-import subprocess
 import threading
 import time
 from collections import deque
@@ -25,12 +25,11 @@ from hw.recording.session import Session
 from hw.robot.motion_plan import MotionPlan
 from hw.runtime.errors import DeviceError
 from hw.runtime.extras import missing
-from hw.runtime.pipes import encode
+from hw.runtime.processes import finish, spawn
 from hw.setup.description import Setup
 from jaxcal import InputError
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Float
-from jaxcal.runtime.isolated import python_command
 
 RATE_HZ = 10.0
 _START_WALL_S = 30.0
@@ -98,13 +97,7 @@ class LiveView(Audience):
         if cure is not None:
             raise InputError(f"--view: {cure}")
         self._say, self._period_s = say, 1.0 / rate_hz
-        self._process = subprocess.Popen(
-            python_command("hw.view.server", str(port)),
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            start_new_session=True,
-        )
+        self._process = spawn("hw.view.server", str(port), stdin=True)
         self.pid = self._process.pid
         self.url = self._greeting()
         assert self._process.stdin is not None
@@ -134,15 +127,8 @@ class LiveView(Audience):
         """End the viewer's process; safe to repeat."""
         self._ending.set()
         self._thread.join()
-        assert self._process.stdin is not None
+        finish(self._process, _END_WALL_S)
         assert self._process.stdout is not None
-        with suppress(OSError):
-            self._process.stdin.close()
-        try:
-            self._process.wait(_END_WALL_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
         self._process.stdout.close()
 
     # What the acquisition tells
@@ -241,7 +227,7 @@ class LiveView(Audience):
             session = self._session
             told = {**self._slow} if self._changed else {}
             self._changed = False
-        frame: dict[str, np.ndarray] = {}
+        frame: np.ndarray | None = None
         if session is not None:
             try:
                 sample = session.poses.latest()
@@ -259,8 +245,8 @@ class LiveView(Audience):
                     pairs = small.shape[1] // 2 * 2
                     small = np.maximum(small[:, :pairs:2], small[:, 1:pairs:2])
                     spacing[0] *= 2
-                frame, told["spacing"] = {"frame": small}, spacing
-        return b"".join(encode(told, frame))
+                frame, told["spacing"] = small, spacing
+        return pickle.dumps((told, frame))
 
     def _greeting(self) -> str:
         """Wait for the viewer; returns the address that it prints once its page can be opened."""

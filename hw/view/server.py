@@ -13,13 +13,12 @@ import functools
 import http.client
 import json
 import os
+import pickle
 import sys
 from collections.abc import Callable
-from contextlib import closing, redirect_stdout
+from contextlib import closing, redirect_stdout, suppress
 from typing import Any
 from urllib.parse import urlsplit
-
-from hw.runtime.pipes import read_message
 
 HOST = "127.0.0.1"
 _OWN_NAMES = (HOST, "localhost")
@@ -58,10 +57,10 @@ def main(port: int) -> int:
         page = Page(server)
         answer(url=f"http://{HOST}:{server.get_port()}")
         answers.close()
-        with os.fdopen(os.dup(0), "rb", buffering=0) as source:
-            while (message := read_message(source)) is not None:
-                told, arrays = message
-                page.show(told, arrays.get("frame"))
+        # The end of the pipe, also in the middle of a message.
+        with suppress(EOFError, pickle.UnpicklingError):
+            while True:
+                page.show(*pickle.load(sys.stdin.buffer))
         server.stop()
     return 0
 

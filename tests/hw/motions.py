@@ -14,7 +14,7 @@ from hw.robot.identity import read_identity
 from hw.robot.limits import Limits
 from hw.robot.motion import Motion
 from hw.robot.motion_plan import MotionPlan
-from hw.robot.pose import ur_to_pose
+from hw.runtime.rigid import ur_to_pose
 
 HOME = ur_to_pose(np.array(START))
 SERIAL = "of the robot at hand"

@@ -52,7 +52,7 @@ from hw.runtime.errors import RefusedError
 from hw.runtime.keys import Pause
 from hw.setup.check import check
 from hw.setup.description import Setup
-from hw.setup.emulated import BenchOracle, setup_of, start
+from hw.setup.emulated import setup_of, start
 from jaxcal import InputError, OutputError
 from jaxcal.cli.main import main
 
@@ -79,8 +79,7 @@ def run(
     def agree(plan: MotionPlan):
         return confirm_unattended(plan, plan.digest, clock=setup.clock)
 
-    oracle = BenchOracle(bench)
-    return acquire(setup, path, request, agree, say=say, oracle=oracle, pause=pause, watch=watch)
+    return acquire(setup, path, request, agree, say=say, emulated=bench, pause=pause, watch=watch)
 
 
 def finish(

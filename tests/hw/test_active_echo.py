@@ -183,14 +183,14 @@ def test_a_second_program_is_refused() -> None:
 
 
 def test_mute_devices(pty_emulator: AuspisEmulator) -> None:
-    pty_emulator.mute()
+    pty_emulator.fault(mute=True)
     with pytest.raises(StaleError, match=r"did not answer STRM within 1 s"):
         opened(pty_emulator)
     pty_emulator.recover()
     with opened(pty_emulator) as device:
         device.stream(True)
         frames_of(device, 2)
-        pty_emulator.mute()
+        pty_emulator.fault(mute=True)
         with pytest.raises(StaleError, match="did not answer"):
             device.threshold()
 
@@ -199,7 +199,7 @@ def test_no_frame_triggers(emulator: AuspisEmulator) -> None:
     with opened(emulator) as device:
         device.stream(True)
         frames_of(device, 3)
-        emulator.stale()
+        emulator.fault(stale=True)
         with pytest.raises(StaleError, match="no frame from"):
             exhaust(device, 2.0)
         assert device.threshold() == 0
@@ -208,12 +208,12 @@ def test_no_frame_triggers(emulator: AuspisEmulator) -> None:
         assert device.statistics().lost == 0
 
 
-@pytest.mark.parametrize("fault", ["miss_triggers", "crc_errors"])
+@pytest.mark.parametrize("fault", ["missed_triggers", "crc_errors"])
 def test_lost_frames_are_counted_and_never_filled(pty_emulator: AuspisEmulator, fault: str) -> None:
     with opened(pty_emulator, queue=2000) as device:
         device.stream(True)
         first = device.read(PATIENCE_S).frame
-        getattr(pty_emulator, fault)(0.3)
+        pty_emulator.fault(**{fault: 0.3})
         frames = frames_of(device, 100)
         pty_emulator.recover()
         frames += frames_of(device, 2)
@@ -237,7 +237,7 @@ def test_missed_line_triggers(pty_emulator: AuspisEmulator) -> None:
     """Nothing tells which line was missed, so the frame is not handed on; it is not lost either."""
     with opened(pty_emulator) as device:
         device.stream(True)
-        pty_emulator.miss_lines(0.5)
+        pty_emulator.fault(missed_lines=0.5)
         frames = frames_of(device, 40)
         seen = device.statistics()
         lines, triggers = device.trigger_count()

@@ -12,7 +12,7 @@ from hw.bench.arm import Arm
 from hw.bench.controller import NORMAL, Controller
 from hw.bench.robot import START as START_DOWN
 from hw.robot.kinematics import MODELS, forward, link_frames, tool_of
-from hw.robot.pose import pose_to_ur, ur_to_pose
+from hw.runtime.rigid import pose_to_ur, ur_to_pose
 
 START = (0.4, 0.0, 0.3, 0.0, 3.0, 0.0)
 

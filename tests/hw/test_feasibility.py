@@ -27,11 +27,10 @@ from hw.robot.kinematics import (
 from hw.robot.limits import Limits
 from hw.robot.motion_plan import MotionPlan, plan_lines
 from hw.robot.path_checks import check_plan
-from hw.robot.pose import pose_to_ur
 from hw.robot.stream import PoseSample
 from hw.runtime.clock import Clock
 from hw.runtime.errors import RefusedError
-from hw.runtime.rigid import straight_way
+from hw.runtime.rigid import pose_to_ur, straight_way
 
 UR5 = MODELS["UR5"]
 OFFSET = (0.0, 0.0, 0.12, 0.0, 0.0, 0.0)

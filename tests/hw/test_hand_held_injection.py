@@ -289,7 +289,7 @@ def test_an_element_that_falls_silent_ends_the_run(tmp_path, bench, monkeypatch)
         def say(self, line: str) -> None:
             super().say(line)
             if line.startswith("started"):
-                bench.echo.stale(True)
+                bench.echo.fault(stale=True)
 
     person = Unplugging(bench.hand)
     with pytest.raises(FreeHandStopped, match="active echo: no frame for"):

@@ -10,8 +10,8 @@ from robots import CB_SERIES, E_SERIES, EmulatedRobot
 
 from hw.bench.robot import model_of
 from hw.robot.kinematics import MODELS, forward, tool_of
-from hw.robot.pose import ur_to_pose
 from hw.robot.stream import PoseStream
+from hw.runtime.rigid import ur_to_pose
 
 OFFSET = (0.0, 0.0, 0.1, 0.0, 0.0, 0.0)
 

@@ -30,6 +30,7 @@ from hw.midplane.pattern_injection import (
 from hw.midplane.terminal_image import Screen, picture
 from hw.planning.poses import plan_poses
 from hw.runtime.interrupts import as_interrupts
+from hw.runtime.keys import Keyboard
 from jaxcal import InputError
 
 
@@ -45,7 +46,7 @@ def sweep_then_middle():
     yield from ["m", "enter"]
 
 
-class Typed:
+class Typed(Keyboard):
     """Keys typed beforehand; None first, so that the view is painted again without one."""
 
     def __init__(self, keys: Iterable[str]) -> None:
@@ -143,9 +144,9 @@ def test_a_block_is_painted_over_itself_and_lines_stay(monkeypatch):
 def test_a_person_before_a_window_finds_the_mid_plane():
     bench = stage()
     camera, rng = Camera(bench.world), np.random.default_rng(1)
-    figure = Figure()
+    figure = Figure(dpi=30)
     canvas = FigureCanvasAgg(figure)
-    window = WindowOperator(figure, camera.spacing_mm)
+    window = WindowOperator(figure)
     keys = iter(sweep_then_middle())
 
     def press(key: str) -> None:

@@ -91,12 +91,12 @@ def fault_in_motion(
 
 def put_in_order(robot: EmulatedRobot) -> None:
     """End every fault, and set at the pendant what the plan says."""
-    robot.mute(False)
-    robot.ask("spoil_dashboard", None)
-    robot.enter(7, 1)
-    robot.set_payload(0.0)
-    robot.set_speed_slider(1.0)
-    robot.set_tcp_offset(OFFSET)
+    robot.ask("unmute")
+    robot.ask("dashboard", None)
+    robot.ask("robot_state", 7, 1)
+    robot.ask("payload", 0.0)
+    robot.ask("speed_slider", 1.0)
+    robot.ask("tcp_offset", OFFSET)
     robot.ask("force", [0.0] * 6)
 
 
@@ -120,10 +120,10 @@ FAULTS = [
     ("backdrive", ["e"], StoppedError, "in backdrive: leave backdrive at the pendant", True),
     ("emergency", ["e"], StoppedError, "robot emergency stop: release the button, then", True),
     ("force", ["CB"], StoppedError, r"a force of 40.0 N", True),
-    ("set_payload", ["CB"], RefusedError, "payload is 2.0 kg", True),
-    ("set_speed_slider", ["e"], RefusedError, "speed slider is at 50 %, not 100", True),
+    ("payload", ["CB"], RefusedError, "payload is 2.0 kg", True),
+    ("speed_slider", ["e"], RefusedError, "speed slider is at 50 %, not 100", True),
     # A CB controller does not tell its TCP offset among its real-time data.
-    ("set_tcp_offset", ["e"], RefusedError, "TCP offset was changed", True),
+    ("tcp_offset", ["e"], RefusedError, "TCP offset was changed", True),
 ]
 
 
@@ -157,12 +157,12 @@ def check_fault(robot: EmulatedRobot, name: str, kind: type, text: str, ends: bo
             "stop": lambda: motion.stop("the operator pressed stop"),
             "kill": lambda: kill_mover(motion),
             "force": lambda: robot.ask("force", [0.0, 0.0, -40.0, 0.0, 0.0, 0.0]),
-            "set_tcp_offset": lambda: robot.ask(name, [0.0, 0.0, 0.2, 0.0, 0.0, 0.0]),
-            "off": lambda: robot.enter(3, 1),
-            "backdrive": lambda: robot.enter(6, 1),
-            "emergency": lambda: robot.enter(3, 7),
-            "set_payload": lambda: robot.set_payload(2.0),
-            "set_speed_slider": lambda: robot.set_speed_slider(0.5),
+            "tcp_offset": lambda: robot.ask(name, [0.0, 0.0, 0.2, 0.0, 0.0, 0.0]),
+            "off": lambda: robot.ask("robot_state", 3, 1),
+            "backdrive": lambda: robot.ask("robot_state", 6, 1),
+            "emergency": lambda: robot.ask("robot_state", 3, 7),
+            "payload": lambda: robot.ask("payload", 2.0),
+            "speed_slider": lambda: robot.ask("speed_slider", 0.5),
         }
         fault = faults.get(name, lambda: robot.ask(name))
         error, rest_s, told_s = fault_in_motion(robot, motion, fault)
@@ -186,13 +186,13 @@ def check_fault(robot: EmulatedRobot, name: str, kind: type, text: str, ends: bo
 def test_a_robot_that_is_faster_than_commanded_is_stopped(robots):
     robot = robots["CB"]
     put_in_order(robot)
-    robot.ask("set_overspeed", 2.0)
+    robot.ask("overspeed", 2.0)
     with moving(robot, caller_s=2.0) as motion:
         target = farther(robot)
         with pytest.raises(StoppedError, match=r"moves at \d+ mm/s: 50 mm/s was commanded"):
             motion.move_to(target)
         assert motion.ended
-    robot.ask("set_overspeed", 1.0)
+    robot.ask("overspeed", 1.0)
     assert abs(1000.0 * robot.state()["raw"][0] - target[0, 3]) > 1.0
 
 
@@ -204,8 +204,8 @@ def test_a_motion_does_not_go_on_when_a_safeguard_stop_is_released(robots, dashb
     with moving(robot, caller_s=2.0) as motion:
 
         def fault() -> None:
-            robot.ask("spoil_dashboard", dashboard)
-            robot.enter(7, 5)
+            robot.ask("dashboard", dashboard)
+            robot.ask("robot_state", 7, 5)
 
         error, *_ = fault_in_motion(robot, motion, fault)
         assert type(error) is StoppedError
@@ -213,7 +213,7 @@ def test_a_motion_does_not_go_on_when_a_safeguard_stop_is_released(robots, dashb
         assert ("stop it at the pendant before" in str(error)) == (dashboard is not None)
         if dashboard is None:
             stood = robot.state()["raw"]
-            robot.enter(7, 1)
+            robot.ask("robot_state", 7, 1)
             time.sleep(0.2)
             assert robot.state()["raw"] == stood
         with pytest.raises(RefusedError, match="confirm the plan again"):
@@ -221,7 +221,7 @@ def test_a_motion_does_not_go_on_when_a_safeguard_stop_is_released(robots, dashb
 
 
 TAKEN_OVER = {
-    "local": ("set_remote", [False], "local control: switch it to remote"),
+    "local": ("remote", [False], "local control: switch it to remote"),
     "play": ("play", [], "another program was started on the robot: stop it at the pendant"),
 }
 """What a person does at the pendant in the middle of a run, and what must be said."""
@@ -265,7 +265,7 @@ def test_a_stop_is_told_though_the_program_ended_at_the_same_moment():
         assert motion._process is not None
         # What comes while it is held up, it sees at once.
         os.kill(motion._process.pid, signal.SIGSTOP)
-        robot.set_payload(2.0)
+        robot.ask("payload", 2.0)
         assert stop_program(robot.host, timeout_s=2.0)
         os.kill(motion._process.pid, signal.SIGCONT)
         time.sleep(0.3)
@@ -356,9 +356,9 @@ def test_a_safety_stop_that_is_over_when_the_mover_looks_ends_motion():
     with EmulatedRobot() as robot, moving(robot, caller_s=2.0) as motion:
         assert motion._process is not None
         os.kill(motion._process.pid, signal.SIGSTOP)
-        robot.enter(7, 5)
+        robot.ask("robot_state", 7, 5)
         time.sleep(0.05)
-        robot.enter(7, 1)
+        robot.ask("robot_state", 7, 1)
         time.sleep(0.05)
         os.kill(motion._process.pid, signal.SIGCONT)
         with pytest.raises(StoppedError, match="safeguard stop: close the gate"):

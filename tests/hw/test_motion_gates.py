@@ -33,10 +33,10 @@ from hw.robot.confirmation import confirm_unattended
 from hw.robot.identity import read_identity
 from hw.robot.motion import Motion
 from hw.robot.motion_plan import MotionPlan
-from hw.robot.pose import ur_to_pose
 from hw.robot.rtde import PacketReader, state_text
 from hw.runtime.clock import REAL
 from hw.runtime.errors import LostError, RefusedError, StaleError, StoppedError
+from hw.runtime.rigid import ur_to_pose
 
 pytest.importorskip("rtde_control", reason="ur_rtde has no wheel for this platform")
 
@@ -196,7 +196,7 @@ def test_a_robot_that_may_not_move_is_sent_nothing_and_its_state_is_named():
     with EmulatedRobot() as robot:
         with closing(PacketReader(robot.host)) as packets:
             for robot_mode, safety_mode, text in STATES:
-                robot.enter(robot_mode, safety_mode)
+                robot.ask("robot_state", robot_mode, safety_mode)
                 deadline, told = time.monotonic() + 5.0, ""
                 while not re.search(text, told) and time.monotonic() < deadline:
                     for packet in packets.read():
@@ -204,18 +204,18 @@ def test_a_robot_that_may_not_move_is_sent_nothing_and_its_state_is_named():
                 assert re.search(text, told)
         # By its mode, by its safety, and by both.
         for robot_mode, safety_mode, text in (STATES[2], STATES[6], STATES[8]):
-            robot.enter(robot_mode, safety_mode)
+            robot.ask("robot_state", robot_mode, safety_mode)
             with pytest.raises(RefusedError, match=text), moving(robot):
                 pass
-        robot.enter(7, 2)
-        robot.ask("set_remote", False)
+        robot.ask("robot_state", 7, 2)
+        robot.ask("remote", False)
         with pytest.raises(RefusedError, match="local control: switch it to remote"), moving(robot):
             pass
         state = robot.state()
         assert "stop" not in state["dashboard"]
         assert state["log"] == []
         assert only_asked(state)
-        robot.ask("spoil_dashboard", "Command is not allowed")
+        robot.ask("dashboard", "Command is not allowed")
         with pytest.raises(LostError, match="no version but 'Command is not allowed'"):
             read_identity(robot.host)
 
@@ -225,12 +225,12 @@ def test_what_is_set_at_the_pendant_is_compared_before_and_during_a_motion():
     with EmulatedRobot(version=CB_SERIES, speed=3.0) as robot:
         with moving(robot) as motion:
             motion.move_to(PLAN.targets[1])
-            robot.set_tcp_offset((0.0, 0.0, 0.2, 0.0, 0.0, 0.0))
+            robot.ask("tcp_offset", (0.0, 0.0, 0.2, 0.0, 0.0, 0.0))
             time.sleep(0.1)
             with pytest.raises(RefusedError, match="TCP offset"):
                 motion.move_to(HOME)
-        robot.set_tcp_offset(OFFSET)
-        robot.set_payload(1.5)
+        robot.ask("tcp_offset", OFFSET)
+        robot.ask("payload", 1.5)
         with pytest.raises(RefusedError, match=r"payload is 1\.5 kg, not 0\.0"), moving(robot):
             pass
         assert len(sent(robot, 3)) == 1

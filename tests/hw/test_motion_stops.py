@@ -92,7 +92,7 @@ from hw.robot.confirmation import confirm_unattended
 from hw.robot.motion_plan import MotionPlan
 host, origin, targets, limits, offset, serial = json.loads(sys.argv[1])
 clock = Clock(1.0, origin)
-plan = MotionPlan.from_poses(targets, Limits.from_mapping(limits), offset, serial)
+plan = MotionPlan(np.array(targets), Limits.from_mapping(limits), tuple(offset), serial)
 given = confirm_unattended(plan, plan.digest, clock=clock)
 with Motion(host, plan, given, clock=clock, dry_run=False) as motion:
     caller = os.getpid()

@@ -16,7 +16,7 @@ from hw.robot.confirmation import Confirmation
 from hw.robot.limits import Limits
 from hw.robot.motion_plan import MotionPlan
 from hw.robot.mover.__main__ import combined
-from hw.robot.mover.inputs import Inputs
+from hw.robot.mover.inputs import Inputs, Stop, StopLatch
 from hw.robot.mover.messages import (
     Caller,
     Setup,
@@ -27,7 +27,6 @@ from hw.robot.mover.messages import (
     told,
 )
 from hw.robot.mover.no_reconnect import NoReconnect
-from hw.robot.mover.stop_latch import Stop, StopLatch
 from hw.robot.rtde import PendantSettings
 from hw.robot.stream import PoseSample
 from hw.runtime.clock import Clock

@@ -19,9 +19,9 @@ import jaxcal
 from hw.acquisition.request import AcquisitionRequest
 from hw.acquisition.stage import ProbeStage
 from hw.bench.frames import COLUMNS, DECIBELS, Camera
-from hw.bench.look import Look
 from hw.bench.phantoms import ActiveEcho, Hydrophone, phantom_named
 from hw.bench.stage import WorldStage
+from hw.bench.tank import Look
 from hw.bench.world import World, make_world
 from hw.midplane.amplitude_scan import amplitude_scan, fit_peak
 from hw.midplane.image_scan import ImageBench, image_scan, pixel_of, place_of
@@ -167,7 +167,9 @@ def test_the_image_scan_puts_the_crossing_into_the_plane_and_locates_it():
     for pose in plan_poses(8, world.scene, seed=1).poses:
         stage = WorldStage(world, pose, rng)
         expected = pixel_of(world.scene.expected(pose)[[0, 2]], camera.spacing_mm, COLUMNS)
-        bench = ImageBench(stage, lambda s=stage: camera.frame(s.true_pose, rng), expected, 120.0)
+        bench = ImageBench(
+            stage.move, lambda s=stage: camera.frame(s.true_pose, rng), expected, 120.0
+        )
         placement = image_scan(bench)
         assert placement.procedure == "image-scan"
         truth = world.truth(stage.true_pose)

@@ -8,8 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from hw.robot.pose import pose_to_ur, ur_to_pose
-from hw.runtime.rigid import rotation_vector, turn_deg
+from hw.runtime.rigid import pose_to_ur, rotation_vector, turn_deg, ur_to_pose
 
 number = st.floats(-4.0, 4.0)
 

@@ -17,8 +17,8 @@ from hw.bench.controller import DONE, READY, Controller
 from hw.bench.robot import RobotProcess
 from hw.bench.rtde import RtdeServer
 from hw.bench.rtde_fields import output_type
-from hw.robot.pose import pose_to_ur, ur_to_pose
 from hw.runtime.clock import Clock
+from hw.runtime.rigid import pose_to_ur, ur_to_pose
 
 rtde_receive = pytest.importorskip("rtde_receive", reason="no wheel of ur_rtde here")
 rtde_control = pytest.importorskip("rtde_control", reason="no wheel of ur_rtde here")
@@ -259,7 +259,7 @@ def test_a_mirror_of_the_arm_follows_the_one_in_the_robot_s_process():
         assert 1e-6 < max(map(abs, error[:3])) < 1e-3
         assert arm.true_raw(0.0) == pytest.approx(first)
         assert control.moveL(beside(-60.0), 0.05, 1.0, True)
-        robot.protective_stop()
+        robot.ask("protective_stop")
         until(lambda: arm.rest_since(clock.now()) is not None)
         assert arm.raw(clock.now()) == pytest.approx(robot.state()["raw"])
         state = robot.state()

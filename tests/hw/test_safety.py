@@ -15,13 +15,13 @@ from scipy.spatial.transform import Rotation, Slerp
 from hw.robot.confirmation import Challenge, Confirmation, confirm, confirm_unattended
 from hw.robot.gate import Command, Gate
 from hw.robot.limits import Limits
-from hw.robot.motion_plan import MotionPlan
+from hw.robot.motion_plan import MotionPlan, array_of
 from hw.robot.path_checks import check_plan
-from hw.robot.pose import pose_to_ur, ur_to_pose
 from hw.robot.rtde import PendantSettings
 from hw.robot.stream import PoseSample
 from hw.runtime.clock import Clock
 from hw.runtime.errors import RefusedError, StaleError
+from hw.runtime.rigid import pose_to_ur, ur_to_pose
 
 SERIAL = "20195500042"
 OFFSET = (0.0, 0.0, 0.1, 0.0, 0.0, 0.0)
@@ -142,7 +142,7 @@ def _spoilt(pose: np.ndarray, k: int, value: float) -> np.ndarray:
 def offer(targets: object, chosen: int, start: np.ndarray, speed: object, age: float) -> bool:
     """Whether a motion came through; if one did, it was safe."""
     try:
-        plan = MotionPlan.from_poses(targets, LIMITS, OFFSET, SERIAL)
+        plan = MotionPlan(array_of(targets, "the plan's poses"), LIMITS, OFFSET, SERIAL)
         check_plan(plan)
         now = sample(start, age=age)
         target = plan.targets[chosen % len(plan.targets)]

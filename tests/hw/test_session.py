@@ -40,7 +40,7 @@ def test_the_period_of_frames_is_the_devices(rate_hz, missed):
         AuspisEmulator(silence, clock=clock, rate_hz=rate_hz, lines=8) as emulator,
         ActiveEcho(emulator.path, clock=clock, lines=8) as device,
     ):
-        emulator.miss_triggers(missed)
+        emulator.fault(missed_triggers=missed)
         device.stream(True)
         frames = [device.read(1200.0) for _ in range(12)]
         hz = device.clock_hz()
@@ -145,6 +145,6 @@ def test_a_pose_that_changes_at_rest_is_no_pose_of_an_image(tmp_path):
             stage = ProbeStage(session, motion, PLAN.targets, lambda kind, text: None)
             stage.go_to(1)
             np.testing.assert_allclose(stage.resting_pose(0.1), PLAN.targets[1], atol=0.2)
-            robot.set_tcp_offset((0.0, 0.0, 0.102, 0.0, 0.0, 0.0))
+            robot.ask("tcp_offset", (0.0, 0.0, 0.102, 0.0, 0.0, 0.0))
             with pytest.raises(RefusedError, match="set the TCP offset as before"):
                 stage.resting_pose(0.1)

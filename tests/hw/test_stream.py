@@ -20,11 +20,11 @@ from robots import CB_SERIES, E_SERIES, START, EmulatedRobot, address
 from hw.bench.arm import Arm
 from hw.bench.rtde import RtdeServer
 from hw.robot.identity import read_identity
-from hw.robot.pose import ur_to_pose
 from hw.robot.rtde import PacketReader, PendantSettings, safety_text
 from hw.robot.stream import PoseSample, PoseStream, average
 from hw.runtime.clock import Clock, Lag
 from hw.runtime.errors import LostError, RefusedError, StaleError
+from hw.runtime.rigid import ur_to_pose
 
 
 @pytest.mark.parametrize("seconds", [1.5, pytest.param(60.0, marks=pytest.mark.slow)])
@@ -60,23 +60,13 @@ def again_and_again(
         time.sleep(0.002)
 
 
-def test_ur_rtde_gives_the_same_poses():
-    pytest.importorskip("rtde_receive", reason="ur_rtde has no wheel for this platform")
-    with EmulatedRobot(version=CB_SERIES) as robot:
-        with PoseStream(robot.host, clock=robot.clock, client="ur_rtde") as poses:
-            sample = poses.latest()
-            assert poses.tcp_offset is None
-        assert sample.raw == pytest.approx(START)
-        assert sample.t_device > 1000.0
-
-
 def test_identity_and_tcp_offset():
     with EmulatedRobot() as robot, PoseStream(robot.host, clock=robot.clock) as poses:
         identity = poses.identity()
         assert (identity.serial, identity.model) == ("20195500042", "UR5")
         assert identity.version == "5.11.0.108249"
         assert poses.tcp_offset == (0.0, 0.0, 0.1, 0.0, 0.0, 0.0)
-        robot.ask("set_tcp_offset", [0.0, 0.0, 0.101, 0.0, 0.0, 0.0])
+        robot.ask("tcp_offset", [0.0, 0.0, 0.101, 0.0, 0.0, 0.0])
         with pytest.raises(RefusedError, match="TCP offset changed"):
             again_and_again(poses.latest)
     with (
@@ -114,8 +104,8 @@ def test_an_arm_is_known_by_its_serial_number_and_calibration(version, serial, c
 def test_payload_and_speed_slider_are_told():
     with EmulatedRobot() as robot, PoseStream(robot.host, clock=robot.clock) as poses:
         assert poses.pendant == PendantSettings(0.0, (0.0, 0.0, 0.0), 1.0)
-        robot.set_payload(0.8, (0.0, 0.0, 0.05))
-        robot.set_speed_slider(0.5)
+        robot.ask("payload", 0.8, (0.0, 0.0, 0.05))
+        robot.ask("speed_slider", 0.5)
         expected = PendantSettings(0.8, (0.0, 0.0, 0.05), 0.5)
         deadline = time.monotonic() + 120.0
         while poses.pendant != expected and time.monotonic() < deadline:
@@ -262,6 +252,10 @@ def test_poses_that_come_late_are_not_new():
                 time.sleep(0.3)
                 with pytest.raises(StaleError, match=r"was on its way for up to \d{3,} ms"):
                     late.latest()
+            # Below the limit, a latency that was there from the start counts in every pose's age.
+            delay[0] = 0.05
+            with PoseStream(host, clock=robot.clock, max_age_s=60.0) as slow:
+                assert min(sample.lag_s for sample in slow.drain()) > 0.04
 
 
 def test_one_slow_start_does_not_make_every_later_pose_look_old():
@@ -354,11 +348,8 @@ def packet(pose: tuple[float, ...]) -> bytes:
 def test_packets_that_do_not_fit_the_recipe_end_the_connection(payload):
     opening = [rtde(b"V", b"\x01"), VERSION, rtde(b"O", TYPES), rtde(b"S", b"\x01")]
     host = answers(*opening[:-1], opening[-1] + rtde(b"M", b"text") + rtde(b"U", payload))
-    with (
-        contextlib.closing(PacketReader(host, timeout_s=30.0)) as reader,
-        pytest.raises(LostError, match=r"bytes came instead|NaN|impossible pose"),
-    ):
-        again_and_again(reader.read)
+    with pytest.raises(LostError, match=r"bytes came instead|NaN|impossible pose"):
+        PacketReader(host, timeout_s=30.0)
 
 
 def test_a_faster_bench_counts_age_in_its_own_time():

@@ -19,7 +19,7 @@ from hw.bench.ultrasound import ImageServer
 from hw.runtime.clock import Clock
 from hw.runtime.errors import DeviceError, LostError, StaleError
 from hw.ultrasound import Image, UltrasoundStream
-from jaxcal.io.message_content import Picture, StatusMessage
+from jaxcal.io.message_content import Picture
 from jaxcal.io.openigtlink import HEADER_SIZE, Message, encode
 
 RNG = np.random.default_rng(11)
@@ -63,14 +63,12 @@ def connected(server: ImageServer, **options) -> UltrasoundStream:
 def test_images_of_our_server(server: ImageServer) -> None:
     with connected(server) as stream:
         images = images_of(stream, 40)
-        status = stream.status()
     assert [image.frame_id for image in images] == list(range(1, 41))
     for image in images:
         np.testing.assert_array_equal(image.array, render(image.t_device - 1_000_000.0))
         assert (image.spacing_mm, image.device, image.is_rf) == ((0.1, 0.2), "Image", False)
         # The machine's clock is a million seconds ahead; nothing comes before it is sent.
         assert image.t_host >= image.t_device - 1_000_000.0 - 1e-6
-    assert status == StatusMessage(1, 0, "", "ready")
 
 
 @contextlib.contextmanager
@@ -159,12 +157,12 @@ def test_one_device_only() -> None:
 def test_stale_frozen_and_back(server: ImageServer) -> None:
     with connected(server) as stream:
         images_of(stream, 3)
-        server.stale()
+        server.fault(stale=True)
         with pytest.raises(StaleError, match="no new image from"):
             exhaust(stream, 1.0)
         server.recover()
         last = images_of(stream, 3)[-1]
-        server.freeze()
+        server.fault(frozen=True)
         until(lambda: stream.statistics().repeated > 3)
         with pytest.raises(StaleError, match="is the machine frozen"):
             exhaust(stream, 1.0)
@@ -194,11 +192,11 @@ def test_corrupted_images_are_counted(server: ImageServer) -> None:
     """Every image handed on is one that was made; those missing are counted."""
     with connected(server, queue=1000) as stream:
         first = stream.read(PATIENCE_S).frame_id
-        server.corrupt(0.4)
+        server.fault(corrupt=0.4)
         until(lambda: server.sent > 120)
         server.recover()
         images = images_of(stream, 60)
-        server.stale()
+        server.fault(stale=True)
         with contextlib.suppress(StaleError):
             while True:
                 images.append(stream.read(1.0))

@@ -7,7 +7,7 @@ import pytest
 
 import jaxcal
 from hw.bench.frames import COLUMNS, ROWS, Camera
-from hw.bench.look import Look
+from hw.bench.tank import Look
 from hw.bench.world import FULL_SCALE, make_world
 from hw.midplane.pattern_injection import bar
 from hw.planning.poses import plan_poses

@@ -7,8 +7,8 @@ so that every pose is checked while the robot moves. When the input ends (the ca
 robot is stopped.
 
 - ``messages``: what the caller and this process tell each other; the caller imports it, too.
-- ``inputs``: everything that comes in: requests, packets, what ur_rtde prints.
-- ``stop_latch``: the stop that stays until the robot rests, or for good.
+- ``inputs``: everything that comes in (requests, packets, what ur_rtde prints), and the latch of a
+  stop, which stays until the robot rests, or for good.
 - ``controller``: the only commands to the robot, the watchdog's kicks, and braking.
 - ``connection``: opening and ending the connection to the controller.
 - ``monitor``: what must stop the robot.

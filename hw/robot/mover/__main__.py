@@ -5,15 +5,14 @@ from __future__ import annotations
 import os
 from typing import NoReturn
 
-from hw.robot._process import ASKS, be_prompt
 from hw.robot.gate import Gate
 from hw.robot.mover.connection import Connection
 from hw.robot.mover.control_loop import ControlLoop
 from hw.robot.mover.controller import Controller
-from hw.robot.mover.inputs import Inputs
+from hw.robot.mover.inputs import Ended, Inputs, Stop
 from hw.robot.mover.messages import Caller, Setup, told
-from hw.robot.mover.stop_latch import Ended, Stop
 from hw.runtime.errors import DeviceError, LostError, StoppedError
+from hw.runtime.processes import ASKS, be_prompt
 
 
 def main() -> NoReturn:

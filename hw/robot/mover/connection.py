@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import math
 import signal
 import threading
 
-from hw.robot._process import ASKS, RECEIVES, be_prompt
 from hw.robot.gate import Gate
 from hw.robot.identity import LOCAL, read_identity, stop_program, until_local
 from hw.robot.limits import numbers
@@ -19,6 +17,7 @@ from hw.robot.rtde import PROGRAM_RUNS, PacketReader, safety_text, state_text, t
 from hw.runtime.clock import Lag
 from hw.runtime.errors import LostError, refused
 from hw.runtime.extras import require
+from hw.runtime.processes import ASKS, RECEIVES, be_prompt
 
 _END_S = 5.0
 """Longest time for the end of the script and of the connection."""
@@ -86,7 +85,7 @@ class Connection:
     def _read_packets(self) -> None:
         reader = PacketReader(self._setup.host)
         asked_s, stamp_s = reader.bound
-        lag = Lag(self._clock.at(asked_s), stamp_s) if math.isfinite(asked_s) else Lag()
+        lag = Lag(self._clock.at(asked_s), stamp_s)
         oldest = self._clock.patience(self._setup.plan.limits.max_pose_age_s)
         problem = too_late(reader.latency_s * self._clock.speed, oldest)
         if problem is not None:

@@ -29,10 +29,9 @@ from hw.robot.gate import Command, Gate
 from hw.robot.limits import numbers
 from hw.robot.mover.connection import Connection
 from hw.robot.mover.controller import Controller
-from hw.robot.mover.inputs import Inputs
+from hw.robot.mover.inputs import Ended, Inputs, Stop
 from hw.robot.mover.messages import Caller, Setup, plain, told
 from hw.robot.mover.monitor import Monitor
-from hw.robot.mover.stop_latch import Ended, Stop
 from hw.robot.stream import PoseSample
 from hw.runtime.errors import DeviceError, RefusedError, StaleError, StoppedError, refused
 from hw.runtime.rigid import turn_deg

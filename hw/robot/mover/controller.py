@@ -17,12 +17,11 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from hw.robot._process import ASKS, be_prompt
-from hw.robot.mover.inputs import Inputs, lost
+from hw.robot.mover.inputs import Ended, Inputs, lost
 from hw.robot.mover.messages import Caller, Setup
-from hw.robot.mover.stop_latch import Ended
 from hw.robot.rtde import PROGRAM_RUNS, Packet, safety_text, state_text
 from hw.runtime.errors import DeviceError, LostError, StoppedError
+from hw.runtime.processes import ASKS, be_prompt
 
 _WATCHDOG_HZ, IDLE_WATCHDOG_HZ = 10.0, 0.5
 """The controller stops its program, and the robot, when it hears nothing for 0.1 s during a motion;

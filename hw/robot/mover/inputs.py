@@ -1,4 +1,4 @@
-"""Everything that comes in: the caller's requests, the controller's packets, ur_rtde's messages.
+"""Everything that comes in (requests, packets, ur_rtde's messages), and the latch of a stop.
 
 A stop cannot be lost: each line of input is handled as soon as it is read, whatever the process
 waits for. A request to stop is latched at once; a request to move waits in a queue. Only a
@@ -11,15 +11,47 @@ import math
 import os
 import select
 from collections import deque
+from dataclasses import dataclass
 
 from hw.robot.mover.messages import Caller
-from hw.robot.mover.stop_latch import Ended, Stop, StopLatch
 from hw.robot.rtde import Packet, PacketReader, PendantSettings
 from hw.robot.stream import PoseSample, offset_changed
 from hw.runtime.clock import Clock, Lag
-from hw.runtime.errors import LostError, StaleError, StoppedError, refused
+from hw.runtime.errors import DeviceError, LostError, StaleError, StoppedError, refused
 
 _RECONNECTS = ("econnect", "Lost connection", "Could not receive", "closed the connection")
+
+
+@dataclass(frozen=True)
+class Stop:
+    """Why the robot must stop, and whether the stop ends motion for good."""
+
+    error: DeviceError
+    for_good: bool
+
+
+class Ended(Exception):
+    """The motion is over for good: the connection, the program or the robot's state is gone."""
+
+    def __init__(self, cause: DeviceError) -> None:
+        self.cause = cause
+
+
+class StopLatch:
+    """Keeps the first stop; a stop for good replaces a hesitation."""
+
+    def __init__(self) -> None:
+        self.stop: Stop | None = None
+
+    def set(self, stop: Stop) -> None:
+        """Latch a stop."""
+        if self.stop is None or (stop.for_good and not self.stop.for_good):
+            self.stop = stop
+
+    def release(self) -> None:
+        """Forget a hesitation, once the robot rests; a stop for good is never released."""
+        assert self.stop is None or not self.stop.for_good
+        self.stop = None
 
 
 class Inputs:
@@ -118,17 +150,7 @@ class Inputs:
         self._unseen.append(packet)
         # In every packet: the newest one may already tell of another program.
         self.program_ended |= self.program_started and not packet.program
-        t_host = self._clock.at(packet.monotonic_s)
-        self._sample = PoseSample(
-            t_host,
-            packet.timestamp_s,
-            packet.tcp_pose,
-            packet.safety_bits,
-            packet.robot_mode,
-            packet.runtime_state,
-            self._lag.of(t_host, packet.timestamp_s),
-            packet.joints,
-        )
+        self._sample = PoseSample.of(packet, self._clock, self._lag)
         changed = "" if self._pendant is None else self._pendant.changed(packet.pendant)
         if changed:
             self._refuse(f"changed at the pendant: {changed}")

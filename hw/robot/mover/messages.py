@@ -17,6 +17,8 @@ import json
 import os
 from dataclasses import asdict, dataclass, replace
 
+import numpy as np
+
 from hw.robot.confirmation import Confirmation
 from hw.robot.limits import Limits
 from hw.robot.motion_plan import MotionPlan
@@ -84,12 +86,12 @@ class Setup:
         cog = plan["pendant"]["payload_cog_m"]
         return cls(
             message["host"],
-            MotionPlan.from_poses(
-                plan["targets"],
+            MotionPlan(
+                np.array(plan["targets"]),
                 Limits.from_mapping(plan["limits"]),
-                plan["tcp_offset"],
+                tuple(plan["tcp_offset"]),
                 plan["serial"],
-                PendantSettings(
+                pendant=PendantSettings(
                     **{**plan["pendant"], "payload_cog_m": None if cog is None else tuple(cog)}
                 ),
             ),

@@ -7,9 +7,8 @@ import math
 from hw.robot.gate import Command
 from hw.robot.identity import LOCAL
 from hw.robot.mover.controller import Controller, unfit
-from hw.robot.mover.inputs import Inputs, lost
+from hw.robot.mover.inputs import Inputs, Stop, lost
 from hw.robot.mover.messages import Setup
-from hw.robot.mover.stop_latch import Stop
 from hw.robot.path_checks import out_of_box_mm
 from hw.robot.rtde import PROGRAM_RUNS
 from hw.runtime.errors import StaleError, StoppedError

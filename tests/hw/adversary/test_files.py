@@ -59,7 +59,7 @@ from hw.bench.robot import START, RobotProcess
 from hw.bench.run import start_bench
 from hw.recording.recorder import Recorder
 from hw.recording.layout import RecordingHeader
-from hw.robot._process import spawn
+from hw.runtime.processes import spawn
 
 probe = {"kind": "linear", "elements": 8, "pitch_mm": 0.5, "sound_speed_m_s": 1490.0}
 with Recorder("rec.h5", RecordingHeader(kind="time_of_flight", probe=probe)) as recorder:

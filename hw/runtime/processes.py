@@ -1,4 +1,4 @@
-"""Starting the small processes that talk to the robot."""
+"""Starting and ending the processes that talk to a device, write a file or show a page."""
 
 from __future__ import annotations
 
@@ -6,11 +6,17 @@ import contextlib
 import os
 import subprocess
 import sys
+from typing import IO
 
 from jaxcal.runtime.isolated import python_command
 
 
-def spawn(module: str, *arguments: str, stdin: bool = False) -> subprocess.Popen[bytes]:
+def spawn(
+    module: str,
+    *arguments: str,
+    stdin: bool = False,
+    stderr: IO[bytes] | int | None = subprocess.DEVNULL,
+) -> subprocess.Popen[bytes]:
     """Start a module in an isolated interpreter (:mod:`jaxcal.runtime.isolated`), output piped.
 
     A fresh interpreter rather than a fork: a fork of a process with threads (JAX has many) may
@@ -21,9 +27,31 @@ def spawn(module: str, *arguments: str, stdin: bool = False) -> subprocess.Popen
         python_command(module, *arguments),
         stdin=subprocess.PIPE if stdin else subprocess.DEVNULL,
         stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
+        stderr=stderr,
         start_new_session=True,
     )
+
+
+def finish(process: subprocess.Popen[bytes], patience_s: float | None) -> bool:
+    """Close a process's input, wait for its end, and kill it if that takes longer.
+
+    Args:
+        process: with or without an input.
+        patience_s: wall s; None: without end.
+
+    Returns:
+        Whether it ended by itself.
+    """
+    if process.stdin is not None:
+        with contextlib.suppress(OSError):
+            process.stdin.close()
+    try:
+        process.wait(patience_s)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+        return False
+    return True
 
 
 def be_prompt(priority: int) -> None:

@@ -1,16 +1,23 @@
-"""The images of a free-hand recording that count, also after it was resumed."""
+"""What both ways to acquire free-hand share: the run, and the images that count, also resumed."""
 
 from __future__ import annotations
 
 import os
+import time
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from typing import ClassVar
 
 import numpy as np
 
+from hw.freehand.posed import PosedImages
+from hw.freehand.request import FreeHand, FreeHandStopped, Person
 from hw.recording.check import opened, read_column
 from hw.recording.file import RecordingWriter
 from hw.recording.recorder import Recorder
-from jaxcal.data.recording import MetresError, check_pose_units
+from hw.runtime.errors import DeviceError
+from jaxcal import CalibrationError, InputError
+from jaxcal.data.recording import MINIMUM_IMAGES, MetresError, check_pose_units
 from jaxcal.io.untrusted import UpTo
 from jaxcal.runtime.array_types import Float
 
@@ -61,6 +68,79 @@ class KeptImages:
         recorder.leave_out(self.rows[-1])
         self.rows.pop()
         self._poses.pop()
+
+
+class Run(ABC):
+    """One run over open devices and an open recording."""
+
+    ends: ClassVar[tuple[str, ...]] = ("q",)
+    """Keys that end the run."""
+    options: ClassVar[tuple[str, ...]] = ()
+    """With which the run goes on, on the command line."""
+
+    def __init__(
+        self,
+        asked: FreeHand,
+        person: Person,
+        posed: PosedImages,
+        recorder: Recorder,
+        kept: KeptImages,
+    ) -> None:
+        self._asked, self._person, self._posed = asked, person, posed
+        self._recorder, self._kept = recorder, kept
+
+    def completed(self) -> int:
+        """Run until enough images are taken, or the person ends it; their number.
+
+        Raises:
+            FreeHandStopped: interrupted, a device was lost, or too few images.
+        """
+        try:
+            with self._recorder:
+                return self._go()
+        except KeyboardInterrupt:
+            reason, interrupted = "interrupted", True
+        except (DeviceError, CalibrationError) as error:
+            reason, interrupted = str(error), False
+        count, kept = len(self._kept), self._recorder.kept
+        raise FreeHandStopped(
+            reason, count, self._asked, kept, *self.options, interrupted=interrupted
+        )
+
+    def _go(self) -> int:
+        self.begin()
+        self.note("started", f"{self._asked.images - len(self._kept)} images to take")
+        while len(self._kept) < self._asked.images:
+            key = self._person.key()
+            if key in self.ends:
+                break
+            if key == "u" and self._kept:
+                self.take_back()
+                self.note("taken back", f"the last image; {len(self._kept)} are left")
+            self.look(key)
+        count = len(self._kept)
+        if count < MINIMUM_IMAGES:
+            raise InputError(f"{count} images are too few: {MINIMUM_IMAGES} are needed")
+        self.note("finished", f"{count} images")
+        self._recorder.finish()
+        return count
+
+    @abstractmethod
+    def begin(self) -> None:
+        """Record what is known before the first image."""
+
+    @abstractmethod
+    def look(self, key: str | None) -> None:
+        """Look at what has come, with the key that was pressed; take an image where it is one."""
+
+    def take_back(self) -> None:
+        """Mask the last image that counts; there is one."""
+        self._kept.take_back(self._recorder)
+
+    def note(self, kind: str, text: str) -> None:
+        """Say a line, and put it among the recording's events."""
+        self._recorder.add_event(kind, text, time.monotonic())
+        self._person.say(f"{kind}: {text}")
 
 
 def read_images(
