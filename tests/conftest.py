@@ -117,12 +117,32 @@ pytest_runtestloop = pytest.hookimpl(tryfirst=True)(pytest_runtestloop)
 REAL_DATA = Path(__file__).parents[2] / "shared" / "data"
 
 
+MOST_MAPPINGS, MOST_MEMORY = 20_000, 3 * 2**29
+"""Mappings of memory, of 65,530 that Linux gives a process, and bytes from which on a worker
+forgets the programs that it holds."""
+
+
+def _is_short_of_room() -> bool:
+    """Whether programs take much of what there is; True where the system does not say."""
+    try:
+        mappings = Path("/proc/self/maps").read_bytes().count(b"\n")
+        pages = int(Path("/proc/self/statm").read_bytes().split()[1])
+    except OSError:
+        return True
+    return mappings > MOST_MAPPINGS or pages * os.sysconf("SC_PAGE_SIZE") > MOST_MEMORY
+
+
 @pytest.fixture(scope="module", autouse=True)
 def _programs_of_one_module():
-    """Compiled programs take memory, and mappings of it, which are limited: forget them."""
+    """Compiled programs take memory, and mappings of it: forget them before these run out.
+
+    Until then the next module has the traces and programs that the last one made.
+    """
     yield
-    jax.clear_caches()
-    executables.forget()
+    if _is_short_of_room():
+        jax.clear_caches()
+        executables.forget()
+        gc.unfreeze()
     gc.collect()
     # What is left stays to the end: no later collection need look through it (0.4 s for a module).
     gc.freeze()
