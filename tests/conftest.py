@@ -18,6 +18,7 @@ from pathlib import Path
 # is for users.
 QUICK = (
     "--xla_backend_optimization_level=0",
+    "--xla_llvm_disable_expensive_passes=true",
     "--xla_cpu_use_fusion_emitters=false",
     # Both cores are busy anyway; programs cut in parts for several threads take longer altogether.
     "--xla_cpu_parallel_codegen_split_count=1",
