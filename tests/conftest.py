@@ -55,7 +55,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 # One cache of compiled programs for all workers and for every process that a test starts, ours and
 # JAX's own: a program is compiled once, unless compiling it is as cheap as keeping it. It is new
-# for each run, so that a run never depends on the last one.
+# for each run, so that a run never depends on the last one; only .ci/run names one for its runs.
 if "JAXCAL_TEST_CACHE" not in os.environ:
     os.environ["JAXCAL_TEST_CACHE"] = tempfile.mkdtemp(prefix="jaxcal-tests-")
     atexit.register(shutil.rmtree, os.environ["JAXCAL_TEST_CACHE"], ignore_errors=True)
