@@ -223,7 +223,7 @@ def test_whitened_errors_are_those_of_the_solve(tracker_sd):
     """Their normal matrix is the solve's information, and their gradient vanishes there."""
     given = {"sigma": (0.2, 0.1, 0.6), "tracker_sd": tracker_sd}
     # With a covariance for each image, and too few to be examined for correlated errors.
-    recording = jaxcal.simulate_recording(jaxcal.Protocol(images=19), 3)
+    recording = jaxcal.simulate_recording(jaxcal.Protocol(images=12), 3)
     result = jaxcal.calibrate(recording, "joint", "gaussian", **given)
     assert float(result.cost) == pytest.approx(sum_of_squares(result, **given), rel=1e-9)
     alone = jax.tree.map(influences._first, result.numpy())

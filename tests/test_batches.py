@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import problem
+from conftest import problem, select
 
 import jaxcal
 from jaxcal.runtime import compiler
@@ -26,9 +26,13 @@ METHODS = {
 IMAGES = 11
 
 
+def drawn(seed: int, **protocol) -> jaxcal.Problem:
+    return select(problem(seed, images=12, **protocol), slice(IMAGES))
+
+
 def hard_problems() -> tuple[list[jaxcal.Problem], list[jaxcal.Problem]]:
     """Ordinary ones; and with a left-out image, an outlier, parallel poses, NaN, half a mask."""
-    good = [problem(k, images=IMAGES, elevation_mm=1.5, noise_mm=1.0) for k in range(6)]
+    good = [drawn(k, elevation_mm=1.5, noise_mm=1.0) for k in range(6)]
     rest, outlier, parallel, lost, half = (jax.tree.map(np.array, one) for one in good[1:])
     rest.mask[3] = 0.0
     outlier.measurements[4, 0] += 30.0
@@ -76,9 +80,7 @@ def test_a_problem_of_a_batch_has_its_own_answer_beside_bad_ones(name):
 
 @pytest.mark.slow
 def test_compiler_flags_change_rounding_only(monkeypatch):
-    problems = jaxcal.stack(
-        [problem(k, images=IMAGES, elevation_mm=1.5, noise_mm=1.0) for k in range(3)]
-    )
+    problems = jaxcal.stack([drawn(k, elevation_mm=1.5, noise_mm=1.0) for k in range(3)])
     fast = jaxcal.calibrate_batch(problems, method="conventional")
     again = jaxcal.calibrate_batch(problems, method="conventional")
     assert np.array_equal(fast.image_to_probe, again.image_to_probe)
@@ -93,7 +95,8 @@ def test_compiler_flags_change_rounding_only(monkeypatch):
 
 
 def test_stacking_compiles_nothing():
-    problems = [problem(k % 3, images=IMAGES) for k in range(7)]
+    problems = [drawn(k % 3) for k in range(7)]
+    jax.clear_caches()
     compiled = []
 
     def listen(event: str, _: float, **__: str | int) -> None:

@@ -59,10 +59,10 @@ def test_every_axis_of_images_is_known(problems):
     # What is computed when it is read is that of the images that are left.
     assert cut.residual.shape == (9, 3)
     assert cut.inspection.outlier.shape == (9,)
-    raw = jaxcal.simulate_recording(jaxcal.Protocol(images=9, raw=True), 1)
-    channels = fill_up(jaxcal.Problem.from_recording(raw), 12).channels
+    raw = jaxcal.simulate_recording(jaxcal.Protocol(images=12, raw=True), 1)
+    channels = fill_up(jaxcal.Problem.from_recording(raw), 16).channels
     assert channels is not None
-    assert channels.distances.shape == channels.heard.shape == (12, 128)
+    assert channels.distances.shape == channels.heard.shape == (16, 128)
     assert channels.elements.shape == (128, 3)
 
 
@@ -121,7 +121,7 @@ def test_masked_images_beyond_the_bucket_change_nothing(name, problems):
 
     The conventional method is compared with the problem without padding below.
     """
-    smaller = simulated(3, images=8, elevation_mm=2.0, noise_mm=0.5)
+    smaller = simulated(3, images=12, elevation_mm=2.0, noise_mm=0.5)
     sources = [
         *problems,
         jax.tree.map(jnp.asarray, taken(smaller, [*range(8), 0])),
@@ -171,6 +171,7 @@ def test_the_answer_is_that_of_the_unpadded_problem(problems):
 @pytest.mark.parametrize("name", METHODS)
 def test_every_number_of_images_in_a_bucket_is_one_program(problems, name):
     executables.forget()
+    jax.clear_caches()
     jaxcal.calibrate(problems[1], **METHODS[name]).numpy()
     fewer = [select(problems[1], slice(0, count)) for count in (9, 10, 11)]
     compiled = []

@@ -83,7 +83,7 @@ def test_no_solver_calls_lapack(arguments: tuple):
         result = jaxcal.calibrate_batch(problem, method, prior, options=options)
         return jnp.sum(result.image_to_probe**2)
 
-    batch = jaxcal.stack([problem(0, images=8), problem(1, images=8)])
+    batch = jaxcal.stack([problem(0, images=12), problem(1, images=12)])
     # The solve and its derivative in one program.
     program = jax.jit(jax.value_and_grad(squares)).lower(batch).as_text()
     assert "while" in program

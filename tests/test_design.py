@@ -342,8 +342,8 @@ def test_a_calibration_of_other_images_is_no_prior(flat):
     fewer = replace(around, taken=around.taken[:-1])
     with pytest.raises(InputError, match=r"the calibration is of \d+ images, \d+ poses"):
         design.next_poses(result, fewer)
-    other = jaxcal.simulate_recording(jaxcal.Protocol(images=4), seed=1)
-    with pytest.raises(InputError, match=r"the calibration is of \d+ images, 4 poses"):
+    other = jaxcal.simulate_recording(jaxcal.Protocol(images=20), seed=1)
+    with pytest.raises(InputError, match=r"the calibration is of \d+ images, 20 poses"):
         design.candidates_around(other, result)
     scaled = replace(around, model=replace(around.model, scale=True))
     with pytest.raises(InputError, match="pixel scales are unknown"):
@@ -484,11 +484,11 @@ def flat():
 
 
 def test_the_trackers_errors_are_those_of_further_images_too():
-    recording = jaxcal.simulate_recording(jaxcal.Protocol(images=10))
+    recording = jaxcal.simulate_recording(jaxcal.Protocol(images=12))
     found = jaxcal.calibrate(recording, "conventional")
     tracked = replace(found.linearisation, tracker_sd=np.array(4.0))
     found = replace(found, method="joint", sigma=np.full(3, 3.0), linearisation=tracked)
-    targets = np.random.default_rng(0).uniform(20.0, 60.0, (10, 3))
+    targets = np.random.default_rng(0).uniform(20.0, 60.0, (12, 3))
     np.testing.assert_allclose(Noise.learned(found, targets).sigma(targets), 5.0, rtol=1e-12)
 
 
@@ -629,12 +629,12 @@ def test_simulated_errors_know_the_law():
 
 
 def test_simulated_errors_count_the_images_taken_before():
-    recording = jaxcal.simulate_recording(jaxcal.Protocol(images=10), seed=1)
+    recording = jaxcal.simulate_recording(jaxcal.Protocol(images=12), seed=1)
     result = jaxcal.calibrate(recording, "conventional")
     around = design.candidates_around(recording, result, count=60)
     more = design.next_poses(result, around, 4)
     found = design.simulate_errors(more, "normal", around, method="conventional")
-    assert found.images == 14
+    assert found.images == 16
     # What was predicted for all of them; 4 SDs are 5 %.
     assert found.tre_mm == pytest.approx(more.tre_mm[-1], rel=0.05)
 

@@ -158,7 +158,7 @@ def test_shared_and_local_unknowns_are_those_of_a_dense_solver(arrow, points, li
 
 def test_what_the_pieces_cannot_take_is_said_in_a_sentence():
     one = jaxcal.Problem.from_recording(
-        jaxcal.simulate_recording(jaxcal.Protocol(images=8), seed=1)
+        jaxcal.simulate_recording(jaxcal.Protocol(images=12), seed=1)
     )
     batch = jaxcal.stack([one, one])
     somewhere = Parameters.of(jnp.eye(3), jnp.zeros(3), jnp.zeros(3))

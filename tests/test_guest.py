@@ -27,10 +27,10 @@ DOCS = Path(__file__).parents[1] / "docs"
 def run_fresh(code: str, folder: Path, **variables: str) -> str:
     """Run a program in a fresh interpreter as a user's; returns what it printed.
 
-    It finds two problems of 8 images in the folder, as ``k-poses.npy`` and ``k-points.npy``.
+    It finds two problems of 12 images in the folder, as ``k-poses.npy`` and ``k-points.npy``.
     """
     for k in range(2):
-        there = problem(k, images=8)
+        there = problem(k, images=12)
         np.save(folder / f"{k}-poses.npy", there.poses)
         np.save(folder / f"{k}-points.npy", there.measurements)
     environment = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "JAXTYPING"))}
@@ -302,7 +302,7 @@ def test_another_solver_is_refused_where_it_cannot_do_it():
     other = Options(solver=optx.LevenbergMarquardt(1e-8, 1e-8))
     for arguments in ({"method": "alternating"}, {"prior": "bounded"}):
         with pytest.raises(jaxcal.InputError, match="bounds"):
-            jaxcal.calibrate(problem(1, images=8), options=other, **arguments)
+            jaxcal.calibrate(problem(1, images=12), options=other, **arguments)
     with pytest.raises(jaxcal.InputError, match="plain numbers"):
         Options(solver=optx.LevenbergMarquardt(jnp.asarray(1e-8), 1e-8))
 

@@ -8,28 +8,29 @@ from conftest import experiment
 
 import jaxcal
 from hw import LiveCalibration
-from jaxcal.runtime import program_cache
+from jaxcal.runtime import executables, program_cache
 
 SIGMA_MM = (0.1, 0.1, 0.5)
 
 
 def test_live_calibration_is_the_batch_one_and_compiles_once(tmp_path, monkeypatch):
-    recording = experiment(0, images=10, noise_mm=0.1, elevation_mm=0.5)
+    recording = experiment(0, images=12, noise_mm=0.1, elevation_mm=0.5)
     images = recording.calibration
-    live = LiveCalibration(capacity=12, sigma=SIGMA_MM)
+    live = LiveCalibration(capacity=14, sigma=SIGMA_MM)
+    executables.forget()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     result = None
     for k, (pose, point) in enumerate(zip(images.poses, images.measurements, strict=True)):
         result = live.add(pose, point)
         assert (result is None) == (k < 3)
-    # From four images to ten, of twelve at most: one program.
+    # From four images to twelve, of fourteen at most: one program.
     assert len(program_cache.entries()) == 1
     whole = jaxcal.calibrate(recording, sigma=SIGMA_MM)
     assert result.status == "converged"
     np.testing.assert_allclose(result.image_to_probe, whole.image_to_probe, atol=1e-7)
-    assert result.elevation.shape == (10,)
+    assert result.elevation.shape == (12,)
     live.leave_out(4)
-    assert int(live.solve().images_used) == 9
+    assert int(live.solve().images_used) == 11
 
 
 def test_bad_images_are_refused_and_not_kept():
@@ -56,10 +57,10 @@ def test_bad_images_are_refused_and_not_kept():
 
 
 def test_times_of_flight_come_to_what_the_file_comes_to():
-    protocol = jaxcal.Protocol(images=9, noise_mm=0.1, elevation_mm=0.5, raw=True)
+    protocol = jaxcal.Protocol(images=12, noise_mm=0.1, elevation_mm=0.5, raw=True)
     recording = jaxcal.simulate_recording(protocol, 1)
     images = recording.calibration
-    live = LiveCalibration(9, kind="time_of_flight", probe=recording.probe, method="conventional")
+    live = LiveCalibration(12, kind="time_of_flight", probe=recording.probe, method="conventional")
     result = None
     for pose, times in zip(images.poses, images.measurements, strict=True):
         times = times.copy()

@@ -15,7 +15,7 @@ from jaxcal import InputError
 
 
 def arrays() -> dict:
-    images = jaxcal.simulate_recording(jaxcal.Protocol(images=6, test_images=4)).calibration
+    images = jaxcal.simulate_recording(jaxcal.Protocol(images=12)).calibration
     return {"poses": np.array(images.poses), "measurements": np.array(images.measurements)}
 
 
@@ -49,7 +49,7 @@ def test_numbers_of_jax_that_numpy_does_not_know_are_numbers():
 
 def test_recordings_can_be_compared_and_kept_in_sets():
     """Arrays have no single truth, so recordings are equal if they are the same."""
-    recording = jaxcal.simulate_recording(jaxcal.Protocol(images=6, test_images=4))
+    recording = jaxcal.simulate_recording(jaxcal.Protocol(images=12))
     other = copy.deepcopy(recording)
     assert recording == recording
     assert recording != other
@@ -71,21 +71,21 @@ except jaxcal.InputError as error:
 
 
 def test_a_recording_says_what_it_holds_without_its_arrays():
-    recording = jaxcal.simulate_recording(jaxcal.Protocol(images=6, test_images=4))
+    recording = jaxcal.simulate_recording(jaxcal.Protocol(images=12))
     said = repr(recording)
     assert said.startswith("Recording('")
-    assert "Images(6 used of 6, points, with covariance" in said
-    assert "test=Images(4 used of 4, points" in said
+    assert "Images(12 used of 12, points, with covariance" in said
+    assert "test=Images(50 used of 50, points" in said
     assert "array" not in said
 
 
 def test_numbers_of_frames_are_whole():
     given = arrays()
-    numbers = np.array([0, 2, 3, 9, 10, 11])
+    numbers = np.array([0, 2, 3, *range(9, 18)])
     np.testing.assert_array_equal(jaxcal.make_images(**given, frame=numbers).frame, numbers)
     for bad in (0.5, -1, np.nan):
         with pytest.raises(InputError, match="frame 1 is no"):
-            jaxcal.make_images(**given, frame=np.array([0, bad, 2, 3, 4, 5]))
+            jaxcal.make_images(**given, frame=np.array([0, bad, *range(2, 12)]))
 
 
 def test_traced_arrays_are_refused_in_words():
@@ -96,18 +96,18 @@ def test_traced_arrays_are_refused_in_words():
 
 @pytest.mark.parametrize("name", ["poses", "measurements", "covariance"])
 def test_numbers_beyond_any_measure_are_refused_with_their_row(name: str):
-    given = arrays() | {"covariance": np.tile(np.eye(2), (6, 1, 1))}
+    given = arrays() | {"covariance": np.tile(np.eye(2), (12, 1, 1))}
     given[name][3].flat[1] = 1e200
     with pytest.raises(InputError, match=r"3 holds a number beyond 1e\+07"):
         jaxcal.make_images(**given)
     # An image left out may hold anything.
-    jaxcal.make_images(**given, mask=np.arange(6) != 3)
+    jaxcal.make_images(**given, mask=np.arange(12) != 3)
 
 
 @pytest.mark.parametrize("name", ["", " ", "\x1b[31mProbe", "Pro\nbe"])
 def test_frames_have_names(tmp_path, name):
     """They are printed, and those of a file are not trusted."""
-    recording = jaxcal.simulate_recording(jaxcal.Protocol(images=6, test_images=4))
+    recording = jaxcal.simulate_recording(jaxcal.Protocol(images=12))
     with pytest.raises(InputError, match="must be the names of two frames"):
         dataclasses.replace(recording, pose_frames=("Probe", name))
     path = tmp_path / "rec.h5"

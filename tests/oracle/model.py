@@ -85,18 +85,21 @@ class Unknowns:
 
 
 def turn(w: np.ndarray) -> np.ndarray:
-    """exp of the cross product matrix, by its series (complex w allowed)."""
-    if not np.any(w):
+    """exp of the cross product matrix K, by its series (complex w allowed).
+
+    K^3 = -(w . w) K, so the odd and the even terms sum to numbers times K and K^2.
+    """
+    x, y, z = w.tolist()
+    if not (x or y or z):
         return np.eye(3)
-    cross = np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
-    total = term = np.eye(3, dtype=cross.dtype)
-    largest = np.abs(w).max()
-    for k in range(1, 40):
-        term = term @ cross / k
-        total = total + term
-        if np.abs(term).max() <= 1e-18 * largest:
-            break
-    return total
+    square = x * x + y * y + z * z
+    odd = even = 0.0
+    first, k = 1.0, 1
+    while abs(first) > 1e-18:
+        odd, even = odd + first, even + first / (k + 1)
+        first, k = -first * square / ((k + 1) * (k + 2)), k + 2
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + odd * cross + even * (cross @ cross)
 
 
 def size(blocks: tuple[str, ...]) -> int:
@@ -126,15 +129,13 @@ def errors(data: Data, u: Unknowns) -> np.ndarray:
     """(n, 3): lateral error, range error, offset."""
     q = target(data, u)
     lateral, distance = points(data, u)
-    return np.stack(
-        [q[:, 0] - lateral, np.sqrt(q[:, 1] ** 2 + q[:, 2] ** 2) - distance, q[:, 1]], axis=1
-    )
+    return np.array([q[:, 0] - lateral, np.sqrt(q[:, 1] ** 2 + q[:, 2] ** 2) - distance, q[:, 1]]).T
 
 
 def circle(data: Data, u: Unknowns, y: np.ndarray) -> np.ndarray:
     """(n, 3): q - p(y)."""
     lateral, distance = points(data, u)
-    return target(data, u) - np.stack([lateral, y + 0 * distance, np.sqrt(distance**2 - y**2)], 1)
+    return target(data, u) - np.array([lateral, y + 0 * distance, np.sqrt(distance**2 - y**2)]).T
 
 
 def channels(data: Data, u: Unknowns) -> np.ndarray:
