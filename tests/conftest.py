@@ -12,6 +12,7 @@ import tempfile
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 # Nearly all of the tests' time is compilation: building each fusion with MLIR is most of that (with
 # jax 0.10), optimising it with LLVM comes next. What XLA does to a program as a whole stays as it
@@ -119,32 +120,12 @@ pytest_runtestloop = pytest.hookimpl(tryfirst=True)(pytest_runtestloop)
 REAL_DATA = Path(__file__).parents[2] / "shared" / "data"
 
 
-MOST_MAPPINGS, MOST_MEMORY = 20_000, 3 * 2**29
-"""Mappings of memory, of 65,530 that Linux gives a process, and bytes from which on a worker
-forgets the programs that it holds."""
-
-
-def _is_short_of_room() -> bool:
-    """Whether programs take much of what there is; True where the system does not say."""
-    try:
-        mappings = Path("/proc/self/maps").read_bytes().count(b"\n")
-        pages = int(Path("/proc/self/statm").read_bytes().split()[1])
-    except OSError:
-        return True
-    return mappings > MOST_MAPPINGS or pages * os.sysconf("SC_PAGE_SIZE") > MOST_MEMORY
-
-
 @pytest.fixture(scope="module", autouse=True)
 def _programs_of_one_module():
-    """Compiled programs take memory, and mappings of it: forget them before these run out.
-
-    Until then the next module has the traces and programs that the last one made.
-    """
+    """Compiled programs take memory, and mappings of it, which are limited: forget them."""
     yield
-    if _is_short_of_room():
-        jax.clear_caches()
-        executables.forget()
-        gc.unfreeze()
+    jax.clear_caches()
+    executables.forget()
     gc.collect()
     # What is left stays to the end: no later collection need look through it (0.4 s for a module).
     gc.freeze()
@@ -167,7 +148,7 @@ def problem(seed: int = 0, **protocol) -> jaxcal.Problem:
     return jaxcal.Problem.from_recording(experiment(seed, **protocol))
 
 
-def select(problem: jaxcal.Problem, rows: object) -> jaxcal.Problem:
+def select(problem: jaxcal.Problem, rows: Any) -> jaxcal.Problem:
     """The problem with only some of its images."""
 
     def pick(name: str) -> object:

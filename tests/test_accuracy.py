@@ -435,7 +435,7 @@ def test_a_small_error_with_a_wide_interval_is_not_good(record):
         changed["tre"]["stated_interval_mm"] = [0.1, upper]
         settle(changed)
         assert changed["verdict"] == word
-        assert any("Add images" in line for line in verdict(changed)) == (word == "uncertain")
+        assert any("20 to 30 degrees" in line for line in verdict(changed)) == (word == "uncertain")
 
 
 def contradicted(kind, record):

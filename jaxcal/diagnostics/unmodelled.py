@@ -178,8 +178,8 @@ def _tuned(
     step = np.zeros(rows.shape[-1])
     # The triangle of each kind's rows and errors has the same sums of squares as all images.
     count, both = len(errors), np.concatenate([rows, errors[..., None]], axis=-1)
-    both = np.linalg.qr(np.swapaxes(both, 0, 1), mode="r")
-    rows, errors = np.swapaxes(both[..., :-1], 0, 1), both[..., -1].T
+    triangle = np.asarray(np.linalg.qr(np.swapaxes(both, 0, 1), mode="r"))
+    rows, errors = np.swapaxes(triangle[..., :-1], 0, 1), triangle[..., -1].T
     for _ in range(_ROUNDS):
         weight = 1 / np.sqrt(variance)[:, None]
         design = (rows * scale * weight).reshape(-1, rows.shape[-1])

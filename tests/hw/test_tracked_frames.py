@@ -111,7 +111,7 @@ def test_orientations_become_mf(code, flip):
 def test_frames_that_are_not_taken(content, reason):
     found, decoder = decoded(message(content) + message(body()))
     assert len(found) == 1
-    assert decoder.counts.unsupported == 1
+    assert decoder.unsupported == 1
     assert reason in decoder.reason
 
 
