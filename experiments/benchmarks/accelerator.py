@@ -37,6 +37,7 @@ METHODS = (
     ("alternating", "auto"),
     ("joint", "gaussian"),
     ("joint", "auto"),
+    ("joint", "bounded"),
 )
 HEADER = ["method", "prior", "images", "accelerator", "problems", "first_call_s",
           "problems_per_s", "cores", "cores_problems_per_s", "ratio", "largest_apart_mm",
@@ -53,7 +54,7 @@ def drawn(images: int) -> Problem:
 
 def timed(problems: Problem, method: str, prior: str) -> tuple[float, float, np.ndarray, int]:
     """Seconds of the first call and of the best of the next ones; X; how many did not converge."""
-    bound = {"max_elevation": 1.0} if method == "alternating" else {}
+    bound = {"max_elevation": 1.0} if method == "alternating" or prior == "bounded" else {}
     seconds: list[float] = []
     x = status = np.zeros(0)
     for _ in range(CALLS + 1):

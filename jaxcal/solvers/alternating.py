@@ -27,6 +27,7 @@ from jaxcal.data.geometry import chord_angle
 from jaxcal.model.batch import ImagePlanes, Iterate, barrier, choose
 from jaxcal.model.observations import BoundedOffsets, FurtherUnknowns, HeldOffsets, local_unknowns
 from jaxcal.solvers import dense
+from jaxcal.solvers.batch_loop import until_done
 from jaxcal.solvers.levenberg_marquardt import (
     Minimum,
     Rounding,
@@ -80,16 +81,17 @@ def alternate(
     none = jnp.zeros_like(images.mask[:, 0])
     eps = jnp.finfo(none.dtype).eps
 
-    def gauss_newton(_: Array, carry: tuple) -> tuple:
-        iterate, held = carry
-        normal = barrier(accumulate(iterate, held, images, None))
-        eye = jnp.eye(len(normal.gradient), dtype=normal.gradient.dtype)[..., None]
-        matrix, gradient = barrier((normal.stacked() * (1 + 16 * eps * eye), normal.gradient))
-        return barrier(iterate.moved(barrier(dense.solve_batch_last(matrix, -gradient)))), held
-
-    def one_round(state: Alternation) -> Alternation:
+    def one_round(state: Alternation, data: tuple) -> Alternation:
+        observation, images = data
         held = HeldOffsets.of(barrier(local_unknowns(state.iterate, observation, images)), images)
-        after, _ = jax.lax.fori_loop(0, inner_steps, gauss_newton, (state.iterate, held))
+
+        def gauss_newton(_: Array, iterate: Iterate) -> Iterate:
+            normal = barrier(accumulate(iterate, held, images, None))
+            eye = jnp.eye(len(normal.gradient), dtype=normal.gradient.dtype)[..., None]
+            matrix, gradient = barrier((normal.stacked() * (1 + 16 * eps * eye), normal.gradient))
+            return barrier(iterate.moved(barrier(dense.solve_batch_last(matrix, -gradient))))
+
+        after = jax.lax.fori_loop(0, inner_steps, gauss_newton, state.iterate)
         kept = state.trace
         if kept is not None:
             kept = recorded(kept, state.iterations, accumulate(after, held, images, None).cost)
@@ -120,7 +122,7 @@ def alternate(
         rotation_change=none + jnp.inf,
         translation_change=none + jnp.inf,
     )
-    state = jax.lax.while_loop(lambda state: jnp.any(active(state)), one_round, state)
+    state = until_done(one_round, state, (observation, images), active)
     normal = barrier(accumulate(state.iterate, observation, images, None))
     rounding = Rounding.of(start, observation, images)
     still = (state.rotation_change < tolerance_rad) & (state.translation_change < tolerance_mm)

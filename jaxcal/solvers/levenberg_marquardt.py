@@ -32,13 +32,13 @@ from dataclasses import fields
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxcal.model.batch import ImagePlanes, Iterate, barrier, choose
 from jaxcal.model.observations import LocalUnknown, MediumPrior, Observation
 from jaxcal.solvers import dense
+from jaxcal.solvers.batch_loop import until_done
 from jaxcal.solvers.normal_equations import NormalEquations, accumulate
 
 ACCEPT_RATIO = 1e-4
@@ -353,6 +353,7 @@ def minimise(
     tolerance: float | None = None,
     max_steps: int = 100,
     trace: int = 0,
+    together: bool = False,
 ) -> Minimum:
     """Minimise every problem's objective.
 
@@ -365,6 +366,8 @@ def minimise(
         tolerance: gradient cosine to stop at; by default 1e-10 in float64, 1e-4 in float32.
         max_steps: most passes.
         trace: how many values of the cost to keep.
+        together: the problems take much the same number of passes, so that none go on alone
+            (:func:`jaxcal.solvers.batch_loop.until_done`).
 
     Returns:
         Where it stopped, for every problem.
@@ -374,18 +377,18 @@ def minimise(
     images, observation = barrier((images.padded(), observation.padded()))
     rounding = barrier(Rounding.of(start, observation, images))
     undamped = damping == 0
-
-    def equations(iterate: Iterate, exact: Array) -> NormalEquations:
-        return accumulate(iterate, observation, images, None if undamped else exact, medium)
-
-    begun = Descent.before(start, jnp.zeros_like(images.mask[:, 0]), damping, trace=trace)
     # The curvature jumps where offsets reach or leave their bounds, so a good exact step says
     # little about the next one.
     decrease_exact = (
         DAMPING_DECREASE if isinstance(observation, LocalUnknown) else DAMPING_DECREASE_EXACT
     )
 
-    def one(state: Descent) -> Descent:
+    def one(state: Descent, data: tuple) -> Descent:
+        observation, images, medium, rounding = data
+
+        def equations(iterate: Iterate, exact: Array) -> NormalEquations:
+            return accumulate(iterate, observation, images, None if undamped else exact, medium)
+
         return iterate_once(
             state,
             equations,
@@ -396,7 +399,9 @@ def minimise(
             decrease_exact=decrease_exact,
         )
 
-    ended: Descent = jax.lax.while_loop(lambda state: jnp.any(state.active), one, begun)
+    begun = Descent.before(start, jnp.zeros_like(images.mask[:, 0]), damping, trace=trace)
+    data = (observation, images, medium, rounding)
+    ended = until_done(one, begun, data, lambda s: s.active, together=together)
     return Minimum(*(getattr(ended, field.name) for field in fields(Minimum)))
 
 

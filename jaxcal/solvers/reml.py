@@ -42,6 +42,7 @@ from jaxcal.model.batch import ImagePlanes, Iterate, barrier, choose
 from jaxcal.model.observations import MediumPrior, Observation
 from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
 from jaxcal.solvers import dense
+from jaxcal.solvers.batch_loop import until_done
 from jaxcal.solvers.levenberg_marquardt import (
     DAMPING_INCREASE,
     LARGEST_DAMPING,
@@ -355,9 +356,8 @@ def self_tuned(
         half_cost=number,
     )
 
-    # Not the bound method itself: JAX hashes what it loops over, and arrays have no hash.
-    return jax.lax.while_loop(
-        lambda state: jnp.any(state.active), lambda state: tuning.iterate_once(state), begun
+    return until_done(
+        lambda state, tuning: tuning.iterate_once(state), begun, tuning, lambda s: s.active
     )
 
 

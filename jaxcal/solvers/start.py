@@ -267,9 +267,8 @@ def conventional(
     """
     start, sound, sums = closed_form(images, blocks)
     cubes = jnp.asarray(cube_rotations(), images.mask.dtype)
-    fit_from = partial(
-        minimise, damping=0.0 if undamped else 1e-3, max_steps=max_steps, trace=trace
-    )
+    damping = 0.0 if undamped else 1e-3
+    fit_from = partial(minimise, damping=damping, max_steps=max_steps, trace=trace, together=True)
     observation = InPlane.of(images)
     fit_from, empty = traced_once(fit_from, start, observation, images)
 
