@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 
@@ -50,9 +51,10 @@ def home(tmp_path, monkeypatch):
 
 def test_a_second_process_does_not_compile_a_batch():
     def run():
-        done = subprocess.run(
-            [sys.executable, "-c", BATCH], capture_output=True, text=True, timeout=300
-        )
+        # Programs of other devices are not kept.
+        environment = os.environ | {"JAX_PLATFORMS": "cpu"}
+        command = [sys.executable, "-c", BATCH]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
         assert done.returncode == 0, done.stderr
         return json.loads(done.stdout)
 
@@ -105,3 +107,16 @@ def test_a_cache_that_cannot_be_used_is_one_line(monkeypatch, capsys):
         assert said.startswith("jaxcal: error: the cache cannot be ")
         assert "is not private to this user" in said
         assert said.count("\n") == 1
+
+
+def test_the_command_line_starts_the_processor_only():
+    """A GPU would compile one calibration for longer than it takes, and lose its memory to it."""
+    script = (
+        "from jaxcal.cli.common import prepare_jax; prepare_jax(); import sys; "
+        "assert 'jax' not in sys.modules; import jax; print(jax.config.jax_platforms)"
+    )
+    plain = {name: value for name, value in os.environ.items() if name != "JAX_PLATFORMS"}
+    for environment, expected in ((plain, "cpu"), (plain | {"JAX_PLATFORMS": "tpu"}, "tpu")):
+        command = [sys.executable, "-c", script]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
+        assert done.stdout.strip() == expected, done.stderr

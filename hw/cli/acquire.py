@@ -24,7 +24,7 @@ from hw.cli.common import (
 from hw.cli.confirming import confirming_by
 from hw.runtime.choices import OPERATORS, PHANTOMS, PLACEMENTS, PLACEMENTS_OF, PLANS
 from jaxcal import InputError
-from jaxcal.cli.common import POSITIVE, ExitCode, verdict_code
+from jaxcal.cli.common import POSITIVE, ExitCode, prepare_jax, verdict_code
 
 if TYPE_CHECKING:
     from hw.acquisition.acquire import Outcome
@@ -148,9 +148,8 @@ def acquire(
     phantom, operator = request.phantom, request.operator
     _check_installed(phantom, bench, move)
     path = recording or f"acquisition-{datetime.now():%Y%m%d-%H%M%S}.h5"
-    from jaxcal.runtime.jax_cache import enable_compilation_cache
 
-    enable_compilation_cache()
+    prepare_jax()
     with ExitStack() as stack:
         emulated = started(stack, bench, bench_seed, speed, controller, phantom)
         setup = setup_of(setup_path, emulated)

@@ -11,7 +11,7 @@ import click
 from hw.cli.common import check_resumed
 from hw.runtime.choices import HAND_PLACEMENTS
 from jaxcal import InputError
-from jaxcal.cli.common import Server, verdict_code
+from jaxcal.cli.common import Server, prepare_jax, verdict_code
 from jaxcal.cli.sequence_options import probe_frame_option, region_option, spacing_option
 
 
@@ -118,7 +118,6 @@ def free_hand(
             acquire_free_hand(path, asked, person, resume=resume)
         screen.clear()
     from hw.acquisition.outcome import calibrate_and_print
-    from jaxcal.runtime.jax_cache import enable_compilation_cache
 
-    enable_compilation_cache()
+    prepare_jax()
     return verdict_code(calibrate_and_print(path))

@@ -1,9 +1,10 @@
 """What solves a problem or a batch by the engine: a kept program on a CPU, else one of JAX's own.
 
 On a CPU, machine code is kept between processes (:mod:`jaxcal.runtime.executables`) in sizes that
-serve many problems; a program that is found there is neither imported, traced nor compiled. On
-other devices, inside somebody's jit, vmap or grad, and with a solver of the caller's own, JAX
-compiles :mod:`jaxcal.calibration.pipeline` as it compiles anything.
+serve many problems; a program that is found there is neither imported, traced nor compiled. So one
+problem is solved on a CPU, unless its arrays were put elsewhere. On other devices, inside
+somebody's jit, vmap or grad, and with a solver of the caller's own, JAX compiles
+:mod:`jaxcal.calibration.pipeline` as it compiles anything.
 """
 
 from __future__ import annotations
@@ -224,10 +225,11 @@ def _is_kept(problems: Problem, plan: SolvePlan, *, inside: bool) -> bool:
         return False
     import jax
 
-    devices = _devices(problems)
     interpreted = jax.config.jax_disable_jit  # pyright: ignore[reportAttributeAccessIssue]
-    one = len(devices) == 1 or not problems.batch_shape
-    return one and devices[0].platform == "cpu" and not interpreted
+    devices = _devices(problems)
+    if not problems.batch_shape:
+        devices = (_held(problems) or (executables.processor() or devices[0],))[:1]
+    return len(devices) == 1 and devices[0].platform == "cpu" and not interpreted
 
 
 def as_jax_holds(arrays: T, problem: Problem) -> T:

@@ -19,6 +19,7 @@ from jaxcal.cli.common import (
     WORDS,
     import_engine,
     json_option,
+    prepare_jax,
     print_json,
     print_page,
     progress,
@@ -237,13 +238,12 @@ def calibrate(
     from jaxcal.report.record import calibration_record, check_test_images
     from jaxcal.report.write import prepare_folder, write_report
     from jaxcal.result.saved import dated
-    from jaxcal.runtime.jax_cache import enable_compilation_cache
 
     measured, notes = segmented(load(recording))
     test_data = None if test is None else segmented(load(test))[0]
     check_test_images(measured, test_data)
     _check_exports(measured, targets, inputs)
-    enable_compilation_cache()
+    prepare_jax()
     with nullcontext() if out is None else prepare_folder(out) as folder:
         if report is not None:
             from jaxcal.report.page import check_page

@@ -141,6 +141,28 @@ class Commands(click.Group):
         return list(self.commands)
 
 
+def prepare_jax() -> None:
+    """Let JAX keep its programs, and start on the processor only; it is not imported here.
+
+    One calibration takes milliseconds there, by a program that is kept. On a GPU it would be
+    compiled anew by every process, and the GPU's memory be taken for it. Only studies fill a GPU.
+    Whoever sets ``JAX_PLATFORMS`` decides.
+    """
+    from jaxcal.runtime.jax_cache import enable_compilation_cache
+    from jaxcal.runtime.when_jax import when_jax_is_imported
+
+    enable_compilation_cache()
+    if "jax" not in sys.modules:  # else somebody's process, which may want its other devices
+        when_jax_is_imported(_only_processor)
+
+
+def _only_processor() -> None:
+    import jax
+
+    if not jax.config.jax_platforms:  # pyright: ignore[reportAttributeAccessIssue]
+        jax.config.update("jax_platforms", "cpu")
+
+
 def print_json(record: dict[str, Any]) -> None:
     """One JSON object on one line of standard output."""
     click.echo(json.dumps(record, allow_nan=False))

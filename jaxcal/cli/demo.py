@@ -13,6 +13,7 @@ from jaxcal.cli.common import (
     exit_code,
     import_engine,
     json_option,
+    prepare_jax,
     print_json,
     print_page,
     progress,
@@ -47,13 +48,12 @@ def demo(out: str | None, seed: int, as_json: bool) -> int:
     from jaxcal.report.record import calibration_record
     from jaxcal.report.write import prepare_folder
     from jaxcal.result.saved import dated
-    from jaxcal.runtime.jax_cache import enable_compilation_cache
     from jaxcal.study.simulation import Protocol, simulate_recording
 
     with nullcontext() if out is None else prepare_folder(out) as folder:
         if folder is not None:
             check_output(folder / RECORDING, "a simulated recording", is_simulated)
-        enable_compilation_cache()
+        prepare_jax()
         with progress("simulating"):
             protocol = Protocol(images=IMAGES, elevation_mm=ELEVATION_MM, noise_mm=NOISE_MM)
             recording = simulate_recording(protocol, seed)

@@ -11,6 +11,7 @@ from jaxcal.cli.common import (
     exit_code,
     import_engine,
     json_option,
+    prepare_jax,
     print_json,
     print_page,
     progress,
@@ -47,10 +48,9 @@ def pivot(poses: str, no_robust: bool, as_json: bool, **options: Any) -> int:
     from jaxcal.io.given_files import naming
     from jaxcal.io.sources import ImportOptions
     from jaxcal.report.pivot import pivot_lines
-    from jaxcal.runtime.jax_cache import enable_compilation_cache
 
     measured, notes = tool_poses(poses, ImportOptions(**options))
-    enable_compilation_cache()
+    prepare_jax()
     with progress("calibrating the pivot"), naming(poses):
         try:
             record = calibrate_pivot(measured, robust=not no_robust).record()

@@ -14,6 +14,7 @@ from jaxcal.cli.common import (
     ExitCode,
     import_engine,
     json_option,
+    prepare_jax,
     print_json,
     print_page,
     progress,
@@ -157,9 +158,8 @@ def plan(
     from jaxcal.design.count import plan_until
     from jaxcal.io.atomic import save_figure
     from jaxcal.io.outputs import begins_with, check_output
-    from jaxcal.runtime.jax_cache import enable_compilation_cache
 
-    enable_compilation_cache()
+    prepare_jax()
     if figure is not None:
         check_output(figure, "a picture", begins_with(*_PICTURES), [recording] if recording else ())
     result = None

@@ -16,6 +16,7 @@ from jaxcal.cli.common import (
     import_code,
     import_engine,
     json_option,
+    prepare_jax,
     print_json,
     print_page,
     progress,
@@ -126,7 +127,6 @@ def segment(
     from jaxcal.io.given_files import naming
     from jaxcal.io.hdf5 import load, save
     from jaxcal.io.outputs import RECORDING, check_output, is_recording
-    from jaxcal.runtime.jax_cache import enable_compilation_cache
 
     target = _default_out(recording) if out is None else out
     # REC itself may be replaced: all of it is in the output, where it is no acquisition.
@@ -134,7 +134,7 @@ def segment(
     data = load(recording)
     check_writable(target)
     probe = _probe(data, sound_speed, temperature)
-    enable_compilation_cache()
+    prepare_jax()
     options: dict[str, Any] = {"method": method, "robust": robust, "scale": scale}
     with progress("segmenting"), naming(recording):
         segmented, found = segment_recording(data, probe, interpolate=interpolate, **options)

@@ -5,7 +5,15 @@ from __future__ import annotations
 import click
 
 from jaxcal import InputError
-from jaxcal.cli.common import NOT_NEGATIVE, POSITIVE, ExitCode, import_engine, progress, seed_option
+from jaxcal.cli.common import (
+    NOT_NEGATIVE,
+    POSITIVE,
+    ExitCode,
+    import_engine,
+    prepare_jax,
+    progress,
+    seed_option,
+)
 
 
 @click.command(short_help="Simulate an experiment and write its recording.")
@@ -74,7 +82,6 @@ def simulate(
     import_engine()
     from jaxcal.data.probe import PRESETS
     from jaxcal.io.hdf5 import save
-    from jaxcal.runtime.jax_cache import enable_compilation_cache
     from jaxcal.study.simulation import Protocol, simulate_recording
 
     protocol = Protocol(
@@ -85,7 +92,7 @@ def simulate(
         probe=PRESETS[probe],
         raw=raw,
     )
-    enable_compilation_cache()
+    prepare_jax()
     with progress("simulating"):
         clock = None if clock_mhz is None else 1e6 * clock_mhz
         recording = simulate_recording(protocol, seed, clock_hz=clock)

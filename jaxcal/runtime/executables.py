@@ -323,12 +323,21 @@ def _remove_from_jaxs_cache(name: str) -> None:
 
 
 def _device(leaves: list[Any]) -> Any:
-    """The device that an array is committed to, else JAX's default."""
+    """The device that an array is committed to, else a processor, else JAX's default."""
     for leaf in leaves:
         if isinstance(leaf, jax.Array) and leaf.committed:
             return next(iter(leaf.devices()))
+    return processor() or jax.local_devices()[0]
+
+
+def processor() -> Any | None:
+    """JAX's default device if that is a processor, else the first one; None if JAX has none."""
     default: Any = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
-    return default if isinstance(default, jax.Device) else jax.local_devices(backend=default)[0]
+    with suppress(RuntimeError):  # JAX_PLATFORMS may name others only
+        if not isinstance(default, jax.Device):
+            default = jax.local_devices(backend=default)[0]
+        return default if default.platform == "cpu" else jax.local_devices(backend="cpu")[0]
+    return None
 
 
 def describe(tree: Any, leaves: list[Any]) -> Description:

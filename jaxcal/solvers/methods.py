@@ -8,6 +8,7 @@ the offsets' laws where they are weighed. One problem is a batch of one.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -179,7 +180,7 @@ def _descended(
 ) -> Minimum:
     """Where the plan's method stops."""
     options, other, start = plan.options, plan.other_solver, begun.iterate
-    limits = {"max_steps": options.max_iterations, "trace": options.trace}
+    limits: dict[str, Any] = {"max_steps": options.max_iterations, "trace": options.trace}
     if plan.method == "conventional":
         if options.solver == "gradient":
             return pairwise_gradient(begun.start, images, options)

@@ -486,7 +486,7 @@ def _drawn(seed: int, protocol: Protocol) -> Experiment:
     """One experiment; on a CPU by a program that is kept."""
     shape, numbers = split_protocol(protocol)
     arguments = (np.asarray(seed, np.int64), tuple(numbers.values()))
-    if jax.default_backend() != "cpu":
+    if executables.processor() is None:
         return jax.jit(_from_numbers, static_argnums=2)(*arguments, shape)
     label = {"method": "simulation", "images": protocol.images}
     return executables.run(_from_numbers, arguments, shape, flags=ONE_PROBLEM, label=label)

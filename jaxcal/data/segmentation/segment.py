@@ -406,7 +406,7 @@ def _fitted(
     distances: Float[np.ndarray, "n elements"], positions: np.ndarray, how: tuple[bool, bool]
 ) -> Fits:
     """The fit; on a CPU by a kept program, which serves many numbers of frames."""
-    if jax.default_backend() != "cpu":
+    if executables.processor() is None:
         return compiled_fit(*how)(distances, positions)
     count, elements = distances.shape
     padded = np.full((executables.padded_images(count), elements), np.nan)

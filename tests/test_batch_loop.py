@@ -1,0 +1,79 @@
+"""The loop over a batch: a large one, whose last problems go on alone, ends as a small one does."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from conftest import problem
+from jaxtyping import Array
+
+import jaxcal
+from jaxcal.model.batch import ImagePlanes
+from jaxcal.model.observations import OwnCovariances
+from jaxcal.model.unknowns import RIGID
+from jaxcal.solvers import batch_loop
+from jaxcal.solvers.batch_loop import FEW, LARGE_BATCH, until_done
+from jaxcal.solvers.levenberg_marquardt import Minimum, minimise
+from jaxcal.solvers.start import closed_form
+
+
+class Halving(eqx.Module):
+    """Numbers that are halved until they are small."""
+
+    value: Array
+    passes: Array
+    active: Array
+
+
+def test_the_last_problems_go_on_alone():
+    draws = np.random.default_rng(20261126)
+    begun = draws.uniform(1, 10, LARGE_BATCH)
+    hard = draws.choice(LARGE_BATCH, LARGE_BATCH // FEW // 2, replace=False)
+    begun[hard] *= 2.0 ** draws.integers(20, 60, len(hard))
+    begun[-1] *= 2.0**70
+    widths = []
+
+    def step(state: Halving, by: Array) -> Halving:
+        widths.append(by.shape[0])
+        value = jnp.where(state.active, state.value * by[:, 0], state.value)
+        return Halving(value, state.passes + state.active, state.active & (value > 1))
+
+    shares = np.tile(draws.choice([0.25, 0.5], (LARGE_BATCH, 1)), (1, 3))
+    state = Halving(jnp.asarray(begun), jnp.zeros(LARGE_BATCH, int), jnp.ones(LARGE_BATCH, bool))
+    found = jax.jit(lambda: until_done(step, state, jnp.asarray(shares), lambda s: s.active))()
+    passes = np.maximum(1, np.ceil(-np.log(begun) / np.log(shares[:, 0])))
+    np.testing.assert_array_equal(found.passes, passes)
+    np.testing.assert_allclose(found.value, begun * shares[:, 0] ** passes, rtol=1e-12)
+    assert not found.active.any()
+    assert {*widths} == {LARGE_BATCH, LARGE_BATCH // FEW}
+
+
+def test_a_solver_does_not_notice(monkeypatch):
+    """Every array of its data goes on with its own problem."""
+    monkeypatch.setattr(batch_loop, "LARGE_BATCH", 24)
+    draws = np.random.default_rng(3)
+    problems = jaxcal.stack([problem(seed, images=8, noise_mm=0.3) for seed in range(24)])
+    images = ImagePlanes.of(problems)
+    start, *_ = closed_form(images, RIGID)
+    far = jnp.zeros((9, 24)).at[4, -1].set(1.0)  # only this one is still active in the end
+    start = start.moved(far)
+    shape = jnp.asarray(draws.uniform(0.5, 2, (3, 24, 8)) * [[[1]], [[0.1]], [[1]]])
+    sigma = jnp.asarray(draws.uniform(0.1, 1, (3, 24)))
+    observation = OwnCovariances(sigma, shape, sigma[1] / sigma[0])
+
+    def solved(*, together: bool) -> Minimum:
+        solve = jax.jit(partial(minimise, max_steps=30, together=together))
+        return solve(start, observation, images)
+
+    alone, whole = solved(together=False), solved(together=True)
+    assert whole.converged.all()
+    assert (whole.iterations[-1] > whole.iterations[:-1] + 1).all()
+    np.testing.assert_array_equal(alone.iterations, whole.iterations)
+    for found, expected in zip(
+        jax.tree.leaves(alone.iterate), jax.tree.leaves(whole.iterate), strict=True
+    ):
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10)
