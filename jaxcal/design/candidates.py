@@ -289,5 +289,7 @@ def seen_region(recording: Recording, targets: Float[np.ndarray, "n 3"]) -> Regi
     lateral, depth = (left - aside, right + aside), (nearest, far + deeper)
     if probe is not None:
         lateral = (min(left, whole.lateral_mm[0]), max(right, whole.lateral_mm[1]))
+    if recording.calibration.kind == "pixel":  # an image has no columns below 0
+        lateral = (max(lateral[0], min(left, 0.0)), lateral[1])
     depth = (min(depth), max(depth))
     return Region(tuple(map(float, lateral)), tuple(map(float, depth)))  # pyright: ignore[reportArgumentType]
