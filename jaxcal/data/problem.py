@@ -274,6 +274,9 @@ def stack(problems: list[Problem]) -> Problem:
     Args:
         problems: at least one; none of them is a batch.
 
+    Returns:
+        One problem, whose arrays have the problems as their first axis.
+
     Raises:
         InputError: none at all, something else than problems, or where they differ in the number of
             images or in what they hold.
