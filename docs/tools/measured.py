@@ -30,7 +30,7 @@ SETTINGS: dict[str, tuple[str, ...]] = {
         "Python 3.11 or newer",
         "BSD 3-clause",
     ),
-    INDEX: ("from 22 to 24 November 2026", "a machine with 16 cores", "some with only 8 images"),
+    INDEX: ("from 22 to 26 November 2026", "a machine with 16 cores", "some with only 8 images"),
     ACCURACY: (
         "+- is a 95 % interval",
         "7 x 7 grid of offsets and noise, for five distributions of the offsets, with 50 images",
