@@ -60,7 +60,7 @@ SETTINGS: dict[str, tuple[str, ...]] = {
         "likelihood can have two maxima there",
         "at 17 points instead of taking the maximum",
         "400 trials a condition, 60 frames of 3 to 20 held poses, and sweeps at 20 frames a second",
-        "the 95 % intervals cover",
+        "The 95 % intervals of `calibrate`",
         "outside a 99 % interval",
         "with 4 to 20 poses",
         "250 clean recordings for each of three distributions and 30, 54 and 200 images",
