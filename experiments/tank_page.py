@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import re
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,15 +13,8 @@ from jaxcal.io.atomic import write_text
 
 PAGE = Path(__file__).parents[1] / "docs" / "results" / "paper-experiment.md"
 RESULTS = Path(__file__).parent / "results"
-FIGURES = ("", "_sensitivity", "_planning", "_bounds")
 _BLOCK = "<!-- table: {} -->\n{}\n<!-- end -->"
 _PATTERN = re.compile(r"<!-- table: ([\w-]+) -->\n.*?<!-- end -->", re.DOTALL)
-
-
-def picture(name: str) -> Path:
-    """Where the site has a figure of results/."""
-    ending = name.replace("_", "-")
-    return PAGE.parents[1] / "images" / f"paper-experiment{ending}.png"
 
 
 def rows(name: str) -> list[dict[str, str]]:
@@ -195,6 +187,4 @@ def page(run: Run) -> None:
     """Write the page's tables; the quick run's are not for it."""
     if not run.quick:
         write_text(PAGE, renewed(PAGE.read_text(encoding="utf-8")))
-        for name in FIGURES:
-            shutil.copyfile(RESULTS / f"paper_experiment{name}.png", picture(name))
         print(PAGE)

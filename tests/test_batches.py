@@ -113,6 +113,20 @@ def test_stacking_compiles_nothing():
     assert batch.measurements.dtype == problems[0].measurements.dtype
 
 
+def test_stacking_unlike_problems_says_in_what_they_differ():
+    one = drawn(0)
+    shorter = jaxcal.Problem.from_arrays(
+        np.asarray(one.poses)[:7], np.asarray(one.measurements)[:7]
+    )
+    bare = jaxcal.Problem.from_arrays(np.asarray(one.poses), np.asarray(one.measurements))
+    for other, message in (
+        (shorter, f"problem 1 has 7 images, problem 0 has {one.images}: pad"),
+        (bare, "problem 1 and problem 0 do not hold the same: sound_speed, delay$"),
+    ):
+        with pytest.raises(jaxcal.InputError, match=message):
+            jaxcal.stack([one, other])
+
+
 @pytest.mark.slow
 def test_a_batch_has_the_derivatives_of_its_problems():
     problems = jaxcal.stack(

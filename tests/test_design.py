@@ -569,6 +569,14 @@ def test_the_region_of_a_shallow_target_is_where_it_was():
     assert seen_region(Recording(images), targets).depth_mm == (5.0, 15.0)
 
 
+def test_the_region_of_pixels_has_no_negative_columns():
+    targets = np.array([[1.0, 0.0, 6.0], [5.0, 0.0, 12.0]])
+    poses, points = np.tile(np.eye(4), (4, 1, 1)), np.ones((4, 2))
+    in_mm, in_px = (Recording(make_images(poses, points, kind)) for kind in ("point", "pixel"))
+    assert seen_region(in_mm, targets).lateral_mm == (-2.0, 8.0)
+    assert seen_region(in_px, targets).lateral_mm == (0.0, 8.0)
+
+
 @pytest.mark.parametrize("count", [4, 10])
 def test_the_figure_is_a_figure(tmp_path, count):
     plan = design.plan(some(200), count)

@@ -159,15 +159,12 @@ def test_given_sds_of_one_size_are_the_gaussian_prior(tank):
     np.testing.assert_allclose(other[1], found[1], atol=1e-6)
 
 
-def test_the_page_has_the_tables_and_figures_of_the_results(tank):
+def test_the_page_has_the_tables_of_the_results(tank):
     page = importlib.import_module("tank_page")
     text = page.PAGE.read_text(encoding="utf-8")
     assert text.count("<!-- table: ") == len(page.TABLES)
     assert page.renewed(text) == text
     assert page.renewed(text.replace("0.8", "0.9")) == text.replace("beam 0.8", "beam 0.9")
-    for name in page.FIGURES:
-        figure = page.RESULTS / f"paper_experiment{name}.png"
-        assert page.picture(name).read_bytes() == figure.read_bytes()
 
 
 @pytest.mark.skipif(not PAPER.exists(), reason="the paper's table is not at hand")

@@ -96,7 +96,7 @@ def words_of(text: str) -> set[str]:
     text = _without_code(text)
     text = re.sub(r"<!--.*?-->", " ", text, flags=re.DOTALL)
     text = re.sub(r"\]\([^)]*\)|^\[\w+\]: \S+$|https?://\S+|^::: .*$", " ", text, flags=re.M)
-    text = re.sub(r"\$\$.*?\$\$", " ", text, flags=re.DOTALL)
+    text = re.sub(r"(\$\$?)[^$]+\1", " ", text)
     return {word.lower() for word in re.findall(r"[^\W\d_]+(?:'[^\W\d_]+)?", text)}
 
 

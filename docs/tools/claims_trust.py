@@ -171,8 +171,8 @@ def _frames(of: str, frames: str, conditions: tuple[str, ...] | None = None) -> 
 
 claim(
     ACCURACY,
-    "cover in {:.1f} to {:.1f} % on average over the parameters; with every frame as an image in "
-    "{:.1f} to {:.1f} %.",
+    "contain the truth in {:.1f} to {:.1f} %, on average over the parameters; if every frame "
+    "counted as an image, in {:.1f} to {:.1f} %.",
     lambda: percent(
         [
             *span(_frames("cover_95_mean", "calibrate", HOLDS + SWEEPS)),
@@ -183,8 +183,8 @@ claim(
 claim(
     ACCURACY,
     "Of 40 or 100 frames along a slow path, whose errors have a correlation of 0, 0.3 or 0.6 in "
-    "successive frames, the intervals of `calibrate` hold in {:.1f} to {:.1f} %; those with every "
-    "frame as an image in {:.1f} to {:.1f} %.",
+    "successive frames, the intervals of `calibrate` contain it in {:.1f} to {:.1f} %; if every "
+    "frame counted as an image, in {:.1f} to {:.1f} %.",
     lambda: percent(
         [
             *span(_frames("cover_95_mean", "calibrate", PATHS)),

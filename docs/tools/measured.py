@@ -30,7 +30,7 @@ SETTINGS: dict[str, tuple[str, ...]] = {
         "Python 3.11 or newer",
         "BSD 3-clause",
     ),
-    INDEX: ("from 22 to 24 November 2026", "a machine with 16 cores", "some with only 8 images"),
+    INDEX: ("from 22 to 26 November 2026", "a machine with 16 cores", "some with only 8 images"),
     ACCURACY: (
         "+- is a 95 % interval",
         "7 x 7 grid of offsets and noise, for five distributions of the offsets, with 50 images",
@@ -60,7 +60,7 @@ SETTINGS: dict[str, tuple[str, ...]] = {
         "likelihood can have two maxima there",
         "at 17 points instead of taking the maximum",
         "400 trials a condition, 60 frames of 3 to 20 held poses, and sweeps at 20 frames a second",
-        "the 95 % intervals cover",
+        "The 95 % intervals of `calibrate`",
         "outside a 99 % interval",
         "with 4 to 20 poses",
         "250 clean recordings for each of three distributions and 30, 54 and 200 images",

@@ -179,7 +179,7 @@ def acquire(
     then = "to go on" if interrupted else "correct this, then"
     raise AcquisitionStopped(
         f"{reason}; {estimator.count} of {job.images} images are in {recorder.kept}; {then}: "
-        f"{resume_command(recorder.kept, job.request)}",
+        f"{resume_command(recorder.kept, job)}",
         interrupted=interrupted,
         by_itself=by_itself and recorder.error is None,
     )
@@ -249,7 +249,7 @@ class _Run:
             without,
             digest,
             self.clock.now() - started,
-            resume_command(recorder.kept, job.request) if again else None,
+            resume_command(recorder.kept, job) if again else None,
         )
 
     def _note(self, kind: str, text: str) -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from hw.acquisition.request import AcquisitionRequest, planned
 from hw.planning.poses import preview
 from hw.recording.file import check_new
@@ -32,7 +34,8 @@ def dry_run(
     motion = MotionPlan(plan.poses, _dry_limits(setup), setup.tcp_offset or (0.0,) * 6, "dry run")
     course = check_plan(motion)
     if figure is not None:
-        preview(plan, Path(figure))
+        box = np.array([motion.limits.box_min_mm, motion.limits.box_max_mm], float)
+        preview(plan, Path(figure), box)
     if course is None:
         known = "model" if setup.tcp_offset is not None else "model and tcp_offset"
         arm = (

@@ -170,7 +170,8 @@ def record_confirmed(job: Job, plan: MotionPlan, session: Session, recorder: Rec
     recorder.sync()
 
 
-def resume_command(path: str | os.PathLike[str], request: AcquisitionRequest) -> str:
+def resume_command(path: str | os.PathLike[str], job: Job) -> str:
     """What to type to go on with a recording."""
-    where = "--bench" if request.bench is not None else "--setup TOML --move"
+    emulated = job.request.bench is not None
+    where = "--bench" if emulated else f"--setup {shlex.quote(job.setup.source)} --move"
     return f"jaxcal-hw acquire {shlex.quote(os.fspath(path))} --resume {where}"

@@ -19,10 +19,15 @@ from jaxcal.cli.sequence_options import probe_frame_option, region_option, spaci
 @click.argument("server", type=Server(), metavar="HOST[:PORT]")
 @click.argument("recording", type=click.Path(), required=False)
 @click.option(
-    "--images", type=click.IntRange(4, 1000), default=30, show_default=True, help="To take."
+    "--images", type=click.IntRange(4, 1000), default=30, show_default=True, help="Images to take."
 )
 @probe_frame_option
-@click.option("--to", "target_frame", metavar="FRAME", help="Frame the target rests in.")
+@click.option(
+    "--to",
+    "target_frame",
+    metavar="FRAME",
+    help="Frame in which the target does not move, e.g. Reference.",
+)
 @click.option("--device", metavar="NAME", help="Device of the images, if several are sent.")
 @click.option(
     "--target",

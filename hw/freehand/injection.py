@@ -167,8 +167,6 @@ def _switch_off(echo: ActiveEcho) -> None:
 class _Run(Run):
     """Images are taken when the person accepts a place in the middle of a sweep."""
 
-    options = ("--placement", _KIND, "--setup", "TOML")
-
     def __init__(
         self,
         asked: FreeHand,
@@ -182,6 +180,7 @@ class _Run(Run):
         kept: KeptImages,
     ) -> None:
         super().__init__(asked, person, posed, recorder, kept)
+        self.options = ("--placement", _KIND, "--setup", setup.source)
         self._setup, self._echo, self._unit, self._changes = setup, echo, unit, changes
         self._images: deque[PosedImage] = deque(maxlen=_RECENT)
         self._waiting: list[EchoFrame] = []

@@ -75,7 +75,7 @@ class Run(ABC):
 
     ends: ClassVar[tuple[str, ...]] = ("q",)
     """Keys that end the run."""
-    options: ClassVar[tuple[str, ...]] = ()
+    options: tuple[str, ...] = ()
     """With which the run goes on, on the command line."""
 
     def __init__(

@@ -211,8 +211,13 @@ def _two_opt(tour: np.ndarray, cost: np.ndarray) -> np.ndarray:
     return tour
 
 
-def preview(plan: PosePlan, path: Path) -> None:
+def preview(plan: PosePlan, path: Path, box_mm: Float[np.ndarray, "2 3"] | None = None) -> None:
     """Write a figure of the plan: tips and axes in the base frame, cone, target over the image.
+
+    Args:
+        plan: the poses in their order.
+        path: the figure's file.
+        box_mm: lowest and highest corner of the box for the probe, base frame; drawn if given.
 
     Raises:
         InputError: ``path`` ends in the name of no format of figures.
@@ -224,9 +229,21 @@ def preview(plan: PosePlan, path: Path) -> None:
     room = figure.add_subplot(1, 3, 1, projection="3d")
     tips = plan.tips_mm
     axial = plan.poses[:, :3, :3] @ plan.scene.image_to_probe[:3, 2]
-    room.plot(*tips.T, "-", color="0.7", linewidth=0.8)
-    room.quiver(*tips.T, *(12.0 * axial.T), color="tab:blue", linewidth=0.8)
-    room.plot(*np.asarray(plan.scene.point_mm)[:, None], "r*", markersize=12)
+    room.plot(*tips.T, "-", color="0.7", linewidth=0.8, label="path of the tip")
+    room.quiver(
+        *tips.T, *(12.0 * axial.T), color="tab:blue", linewidth=0.8, label="axial direction"
+    )
+    target = np.asarray(plan.scene.point_mm)[:, None]
+    room.scatter(*target, color="red", marker="*", s=100, label="target")
+    if box_mm is not None:
+        corners = box_mm[list(np.ndindex(2, 2, 2)), range(3)]
+        for k, one in enumerate(corners):
+            for other in corners[k + 1 :]:
+                if np.count_nonzero(one != other) == 1:
+                    room.plot(*np.stack([one, other], 1), color="tab:orange", linewidth=1.0)
+        room.plot([], [], [], color="tab:orange", label="box for the probe")
+        room.set_aspect("equal")
+    room.legend(loc="upper left", fontsize=7, frameon=False)
     room.set(
         xlabel="x (mm)",
         ylabel="y (mm)",
@@ -241,7 +258,8 @@ def preview(plan: PosePlan, path: Path) -> None:
     cone.set_title("axial direction: tilt (degrees)")
 
     image = figure.add_subplot(1, 3, 3)
-    image.scatter(*plan.expected.T, c=np.arange(len(plan)), s=16)
+    dots = image.scatter(*plan.expected.T, c=np.arange(len(plan)), s=16)
+    figure.colorbar(dots, ax=image, label="pose, in the order of the plan")
     image.set(
         xlabel="lateral (mm)", ylabel="range (mm)", title="target in the image", aspect="equal"
     )

@@ -66,6 +66,7 @@ class Setup:
         model: of the arm, by name; None: what the controller says.
         housing_mm: width, thickness and length of the probe's housing; None: the array's width, 25
             and 60 mm.
+        source: the file that it was read from, for messages.
     """
 
     robot_host: str
@@ -84,6 +85,7 @@ class Setup:
     frames: int = 9
     model: str | None = None
     housing_mm: tuple[float, float, float] | None = None
+    source: str = "TOML"
 
     def motion_limits(self, controller_model: str | None = None) -> Limits:
         """What bounds every motion of this bench.
@@ -126,12 +128,14 @@ class HandHeldSetup:
         image_to_probe: (4, 4) X as drawn or measured with a ruler, mm: image frame to the tracked
             frame on the probe.
         search: stated accuracies, and the threshold of the response.
+        source: the file that it was read from, for messages.
     """
 
     active_echo_url: str
     image_to_probe: Float[np.ndarray, "4 4"]
     probe: LinearProbe = field(default_factory=LinearProbe)
     search: Settings = field(default_factory=Settings)
+    source: str = "TOML"
 
 
 def load_hand_held(path: str | os.PathLike[str]) -> HandHeldSetup:
@@ -156,6 +160,7 @@ def load_hand_held(path: str | os.PathLike[str]) -> HandHeldSetup:
             check_poses(drawn[None])[0],
             probe,
             Settings(**found["search"]),
+            os.fspath(path),
         )
 
 
@@ -192,7 +197,8 @@ def load_setup(path: str | os.PathLike[str]) -> Setup:
         except RefusedError as error:
             raise InputError(f"[limits] {error.args[0]}") from None
         reach = _reach_mm("reach_mm" in tables.get("search", {}), setup.search, limits)
-        return replace(setup, search=replace(setup.search, reach_mm=reach))
+        search = replace(setup.search, reach_mm=reach)
+        return replace(setup, search=search, source=os.fspath(path))
 
 
 def _reach_mm(given: bool, search: Settings, limits: Limits) -> float:

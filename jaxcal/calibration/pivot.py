@@ -67,7 +67,7 @@ class Pivot(eqx.Module):
         mask: 1 for used poses.
         outlier: 1 where a pose does not fit the rest; a robust solve leaves it out.
         studentised_errors: errors of all poses, in robust SDs of the used poses' errors.
-        status_code: a :class:`jaxcal.result.calibration.Status`.
+        status_code: a :class:`jaxcal.Status`.
         information: of (tip, point) for errors with an SD of 1 mm.
         robust: poses that do not fit the rest were left out (static).
     """

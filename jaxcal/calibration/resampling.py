@@ -135,6 +135,9 @@ def cross_validate(
             held out.
         arguments: as for :func:`jaxcal.calibrate`.
 
+    Returns:
+        Errors of the held-out images, and how much each image moves X: a :class:`CrossValidation`.
+
     Raises:
         InputError: too few images, folds that are not from 2 to the number of images, options that
             contradict each other, or a result by another method than they ask for.
@@ -209,6 +212,9 @@ def bootstrap(
         result: the calibration of all images, if it exists already: by the same method, with the
             same prior, data and unknowns. Images that it left out as outliers are not drawn.
         arguments: as for :func:`jaxcal.calibrate`.
+
+    Returns:
+        X of every resample and its scatter: a :class:`Bootstrap`.
 
     Raises:
         InputError: fewer than 2 resamples, options that contradict each other, or a result by

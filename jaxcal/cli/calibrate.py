@@ -64,8 +64,8 @@ EXPORTS: tuple[SaveFormat, ...] = ("plus", "slicer", "itk", "ros", "tusrec", "nu
     "--max-elevation",
     type=POSITIVE,
     metavar="MM",
-    help="Bound on the offsets, with --method alternating and --prior bounded (without it the "
-    "recording's own, or 1 mm), auto and uniform (without it the recording's own, if any).",
+    help="Bound on the offsets instead of the recording's own, except with --prior gaussian. "
+    "Without either: 1 mm with --method alternating and --prior bounded, none with other priors.",
 )
 @click.option(
     "--sigma",

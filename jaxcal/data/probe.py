@@ -89,7 +89,7 @@ class LinearProbe(_Array):
         elements: number of transducer elements, at least 2.
         pitch_mm: distance between neighbouring element centres, mm.
         sound_speed_m_s: sound speed assumed for ranges, m/s (1490: water at room temperature;
-            :func:`jaxcal.data.sound.sound_speed_in_water` gives it for others).
+            :func:`jaxcal.sound_speed_in_water` gives it for others).
         delay_s: fixed delay of the electronics, s: time of flight = distance / sound speed + delay.
     """
 

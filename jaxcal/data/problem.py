@@ -274,6 +274,9 @@ def stack(problems: list[Problem]) -> Problem:
     Args:
         problems: at least one; none of them is a batch.
 
+    Returns:
+        One problem, whose arrays have the problems as their first axis.
+
     Raises:
         InputError: none at all, something else than problems, or where they differ in the number of
             images or in what they hold.
@@ -286,12 +289,22 @@ def stack(problems: list[Problem]) -> Problem:
     for index, problem in enumerate(problems):
         if not isinstance(problem, Problem):
             raise InputError(f"stack takes problems, {index} is {type(problem).__name__}")
-    first = jax.tree.structure(problems[0])
+    first = problems[0]
     for index, problem in enumerate(problems):
-        if jax.tree.structure(problem) != first or problem.images != problems[0].images:
+        if problem.images != first.images:
             raise InputError(
-                f"problem {index} differs from problem 0 in its number of images or in its parts; "
-                "pad it with images that are masked out"
+                f"problem {index} has {counted(problem.images, 'image')}, problem 0 has "
+                f"{first.images}: pad the shorter one with images that are masked out"
+            )
+        if jax.tree.structure(problem) != jax.tree.structure(first):
+            unlike = [
+                name
+                for name, value in vars(problem).items()
+                if (value is None) != (getattr(first, name) is None)
+                or (isinstance(value, bool) and value != getattr(first, name))
+            ]
+            raise InputError(
+                f"problem {index} and problem 0 do not hold the same: {', '.join(unlike)}"
             )
 
     def stacked(*leaves: Any) -> Any:

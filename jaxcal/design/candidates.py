@@ -191,6 +191,9 @@ def make_candidates(
         model: X, target and SDs as far as they are known.
         seed: another seed gives other candidates of the same quality.
 
+    Returns:
+        Poses to choose from, for :func:`jaxcal.design.plan` and :func:`jaxcal.design.next_poses`.
+
     Raises:
         InputError: constraints that leave too few poses.
     """
@@ -234,6 +237,9 @@ def candidates_around(
         turn_deg: largest turn either way; by default that of the images, at least 60 degrees.
         constraints: replace ``region``, ``cone_deg``, ``turn_deg`` and the mean orientation.
         seed: see :func:`make_candidates`.
+
+    Returns:
+        Poses to choose from, for :func:`jaxcal.design.plan` and :func:`jaxcal.design.next_poses`.
 
     Raises:
         InputError: a calibration that failed.
@@ -289,5 +295,7 @@ def seen_region(recording: Recording, targets: Float[np.ndarray, "n 3"]) -> Regi
     lateral, depth = (left - aside, right + aside), (nearest, far + deeper)
     if probe is not None:
         lateral = (min(left, whole.lateral_mm[0]), max(right, whole.lateral_mm[1]))
+    if recording.calibration.kind == "pixel":  # an image has no columns below 0
+        lateral = (max(lateral[0], min(left, 0.0)), lateral[1])
     depth = (min(depth), max(depth))
     return Region(tuple(map(float, lateral)), tuple(map(float, depth)))  # pyright: ignore[reportArgumentType]

@@ -99,8 +99,8 @@ def gain(
 
     Args:
         pose: probe -> tracker, mm.
-        covariance: S before.
-        weight: W.
+        covariance: S, of all unknowns before this image (mm, rad, and log units of pixel scales).
+        weight: W, by which the criterion is the trace tr(W S).
         model: X, target and SDs.
     """
     import jax.numpy as jnp

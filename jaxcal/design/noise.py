@@ -47,7 +47,10 @@ def check_result(result: object) -> None:
 
 @dataclass(frozen=True)
 class Noise:
-    """A noise model.
+    """SDs of lateral position, range and elevational offset by the target's place in the image.
+
+    ln SD_k = a_k0 + a_k1 d + a_k2 d^2 + a_k3 x^2 (SD in mm), where d = depth / 50 mm - 1 and
+    x = lateral position / 25 mm.
 
     Attributes:
         coefficients: (3, 4), a_k0 to a_k3 for the rows k = lateral, range, elevational.

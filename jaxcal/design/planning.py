@@ -128,6 +128,9 @@ def plan(
             second, and poses are not exchanged.
         rules: space filling and replicates.
 
+    Returns:
+        The poses in the order in which they were chosen, with the errors predicted after each.
+
     Raises:
         InputError: candidates that do not determine the unknowns (the message says what is
             missing), or a number of poses that is too small or too large.

@@ -69,6 +69,9 @@ def compare_calibrations(
         second: another one; both take pixels, or both points in mm.
         points: [u, v] of image points, px, or [lateral, range] in mm.
 
+    Returns:
+        How far apart the points are, and what the covariances expect: a :class:`Comparison`.
+
     Raises:
         InputError: what is no calibration, one that must not be used, only one that takes pixels,
             or points that :meth:`ImageTransform.apply` refuses.

@@ -23,7 +23,7 @@ def reconstruction_precision(
     """Point reconstruction precision, Eq. 8: norm of the SD of B_i X p_i over the images, mm.
 
     Args:
-        image_to_probe: X.
+        image_to_probe: (4, 4) X, mm.
         poses: B_i of the *test* images, probe -> tracker, mm.
         points: (n, 2) [lateral, range], assumed in the plane, or (n, 3) in the image frame, mm.
         mask: (n,) 1 (or True) for images to count; all by default. The others may hold anything.

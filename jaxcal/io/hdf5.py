@@ -126,7 +126,7 @@ def save(
 
     Raises:
         InputError: the recording is one that ``load`` would refuse (its arrays were not checked by
-            :func:`jaxcal.data.recording.make_images`, or are too large).
+            :func:`jaxcal.make_images`, or are too large).
         OutputError: the file could not be written; it is as it was.
     """
     check_recording(recording, "jaxcal.save")

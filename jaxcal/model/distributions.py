@@ -55,7 +55,7 @@ class OffsetLaw:
     """What was found out about the offsets and the noise.
 
     Attributes:
-        probability: of each family of ``FAMILIES``.
+        probability: of the families uniform, bell, gaussian and student, in this order.
         mean: expectation of the offsets' mean, mm.
         mean_sd: standard deviation of that mean, mm.
         mean_probability: that there is a mean other than zero.
@@ -63,7 +63,7 @@ class OffsetLaw:
             residuals have heavy tails, or are correlated between successive images.
         own_probability: that the images' own covariances describe the errors better than common
             SDs do; 0 where there are none.
-        weighed: the laws were weighed; otherwise the plain Gaussian answer stands.
+        weighed: the distributions were weighed; if not, the answer is that of the Gaussian one.
     """
 
     probability: Float[HeldArray, "*batch families"]

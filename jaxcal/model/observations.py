@@ -382,7 +382,7 @@ class InPlane(Observation):
     """q - p(0), every target taken to lie in the image plane: the conventional Eq. 7, mm.
 
     Attributes:
-        sigma: one.
+        sigma: ones; the residuals stay in mm.
     """
 
     sigma: Float[Array, "1 batch"]
@@ -404,7 +404,7 @@ class HeldOffsets(Observation):
     """q - p(y) with the offsets y held, mm.
 
     Attributes:
-        sigma: one.
+        sigma: ones; the residuals stay in mm.
         offset: y_i, mm.
     """
 
@@ -468,7 +468,7 @@ class BoundedOffsets(LocalUnknown):
     """|y_i| <= bound_i and equal weights: the objective that the paper's alternation descends.
 
     Attributes:
-        sigma: one.
+        sigma: ones; the residuals stay in mm.
         bound: m_i, mm; at most 0.95 of the image's range is used.
 
     Raises:

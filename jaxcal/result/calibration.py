@@ -28,7 +28,14 @@ if TYPE_CHECKING:
 
 
 class Status(enum.IntEnum):
-    """How a solve ended; ``Calibration.status`` gives the name in lower case."""
+    """How a solve ended; ``Calibration.status`` gives the name in lower case.
+
+    Attributes:
+        CONVERGED: the method's own stopping rule was met.
+        MAX_ITERATIONS: it was not met within the largest number of iterations.
+        UNOBSERVABLE: the images do not determine X.
+        FAILED: there is no calibration: too few images, or NaN or Inf.
+    """
 
     CONVERGED = 0
     MAX_ITERATIONS = 1

@@ -104,8 +104,12 @@ def test_bad_scenes_are_refused():
 
 def test_preview_is_a_figure(tmp_path):
     path = tmp_path / "plan.png"
-    preview(plan_poses(12, SCENE), path)
-    assert path.read_bytes().startswith(b"\x89PNG")
+    plan = plan_poses(12, SCENE)
+    preview(plan, path)
+    without = path.read_bytes()
+    assert without.startswith(b"\x89PNG")
+    preview(plan, path, np.array([[180.0, -420.0, 40.0], [520.0, -80.0, 270.0]]))
+    assert path.read_bytes() != without
 
 
 def a_setup(**changes) -> Setup:

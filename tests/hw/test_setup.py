@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 import tomllib
 from dataclasses import replace
 
@@ -10,6 +11,8 @@ import numpy as np
 import pytest
 
 import jaxcal
+from hw.acquisition.job import Job, resume_command
+from hw.acquisition.request import AcquisitionRequest
 from hw.cli.main import main
 from hw.setup.description import _TABLES, load_setup
 
@@ -64,6 +67,10 @@ def test_a_description_is_read(tmp_path):
     assert (setup.search.fine_mm, setup.search.frames) == (0.2, 5)
     assert setup.limits["cone_deg"] == 60
     np.testing.assert_array_equal(setup.scene.tip_mm, [0, 0, 60])
+    job = Job(setup, AcquisitionRequest(), np.zeros((0, 4, 4)), None)
+    assert resume_command("r.h5", job) == (
+        f"jaxcal-hw acquire r.h5 --resume --setup {shlex.quote(str(path))} --move"
+    )
     path.write_text(GOOD.replace("search_mm = 25", "search_mm = 8"))
     assert load_setup(path).search == replace(setup.search, reach_mm=8.0)
 
