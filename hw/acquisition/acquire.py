@@ -71,12 +71,16 @@ class AcquisitionStopped(CalibrationError):
     """A run that ended early; one line with what happened and what to do next.
 
     Attributes:
+        reason: what happened.
         exit_code: of the command line.
         by_itself: whether it may be resumed without a person's help.
     """
 
-    def __init__(self, message: str, *, interrupted: bool = False, by_itself: bool = False) -> None:
-        super().__init__(message)
+    def __init__(
+        self, reason: str, then: str, *, interrupted: bool = False, by_itself: bool = False
+    ) -> None:
+        super().__init__(f"{reason}; {then}")
+        self.reason = reason
         self.by_itself = by_itself
         self.exit_code = ExitCode.INTERRUPTED if interrupted else ExitCode.STOPPED
 
@@ -178,7 +182,8 @@ def acquire(
         reason = str(recorder.error)
     then = "to go on" if interrupted else "correct this, then"
     raise AcquisitionStopped(
-        f"{reason}; {estimator.count} of {job.images} images are in {recorder.kept}; {then}: "
+        reason,
+        f"{estimator.count} of {job.images} images are in {recorder.kept}; {then}: "
         f"{resume_command(recorder.kept, job)}",
         interrupted=interrupted,
         by_itself=by_itself and recorder.error is None,

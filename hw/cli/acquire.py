@@ -265,7 +265,7 @@ def _acquire(
                 if error.exit_code == ExitCode.INTERRUPTED or not error.by_itself:
                     raise
                 # A busy machine trips the emulated controller's watchdog: resume without a person.
-                say(f"stopped: {error}")
+                say(f"stopped, and resumed: {error.reason}")
                 request = None
         return _finished(path, attempt(request), setup)
 
