@@ -23,9 +23,9 @@ def calibrate_closed_form(
 ) -> ClosedForm:
     """Conventional calibration (Eq. 7) in closed form, with a certificate.
 
-    One problem is solved by numpy alone (:mod:`jaxcal.solvers.closed_form.single`). A batch, and a
-    problem that ``jax.jit``, ``jax.vmap`` or ``jax.grad`` looks at, is solved by
-    :mod:`jaxcal.solvers.closed_form.batch`.
+    One problem is solved by numpy alone (:mod:`jaxcal.solvers.closed_form.single`), and so is each
+    of up to 1024 problems of a batch. A larger batch, and a problem that ``jax.jit``, ``jax.vmap``
+    or ``jax.grad`` looks at, is solved by :mod:`jaxcal.solvers.closed_form.batch`.
 
     Args:
         problem: a problem or a batch of them, a recording, or one set of images; a list of them is
