@@ -363,6 +363,22 @@ def test_what_cannot_be_asked_for():
     broken = dataclasses.replace(problem, measurements=problem.measurements.at[4].set(np.nan))
     with pytest.raises(jaxcal.InputError, match="measurements of image 4"):
         jaxcal.calibrate_closed_form(broken)
+    with pytest.raises(jaxcal.InputError, match="outside of jit"):
+        jax.jit(lambda given: jaxcal.certify(given, np.eye(4)).gap_mm2)(problem)
+
+
+def test_names_to_estimate_are_taken_as_by_calibrate():
+    images = drawn(1, 8)
+    named = jaxcal.calibrate_closed_form(images, estimate=("sound-speed",))
+    listed = jaxcal.calibrate_closed_form(images, estimate=["sound-speed"])
+    assert named.sound_speed_factor == listed.sound_speed_factor != 1
+    proof = jaxcal.certify(
+        images,
+        named.image_to_probe,
+        sound_speed_factor=named.sound_speed_factor,
+        estimate="sound-speed",
+    )
+    assert proof.certified
 
 
 def test_the_relaxation_proves_a_bound_wherever_it_stops():

@@ -28,17 +28,16 @@ from jaxcal.calibration.calibrate import (
     calibrate,
     calibrate_batch,
     prepare,
-    unknown_names,
 )
 from jaxcal.calibration.dependence import independent
 from jaxcal.calibration.engine import as_jax_holds
 from jaxcal.data.problem import Problem, as_problem
-from jaxcal.data.recording import MINIMUM_IMAGES, Recording
+from jaxcal.data.recording import MINIMUM_IMAGES, Images, Recording
 from jaxcal.diagnostics.image_errors import noise_covariance
 from jaxcal.diagnostics.intervals import range_of_row_zero
 from jaxcal.diagnostics.metrics import calibration_reproducibility
 from jaxcal.model.thresholds import MAD
-from jaxcal.model.unknowns import Values, measured, split_further
+from jaxcal.model.unknowns import Values, measured, split_further, unknown_names
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import AnyArray
 from jaxcal.runtime.arrays import array_module, each_image, is_traced, map_arrays
@@ -121,7 +120,7 @@ class Bootstrap(eqx.Module):
 
 @in_own_modes
 def cross_validate(
-    problem: Problem | Recording,
+    problem: Problem | Recording | Images,
     *,
     folds: int | None = None,
     result: Calibration | None = None,
@@ -130,7 +129,7 @@ def cross_validate(
     """Hold out each image (or fold of images) in turn, and calibrate from the others.
 
     Args:
-        problem: one problem or a recording.
+        problem: one problem, a recording, or one set of images.
         folds: image i belongs to fold i mod folds; by default every image is a fold of its own.
         result: the calibration of all images, if it exists already: by the same method, with the
             same prior, data and unknowns. Images that it left out as outliers are neither used nor
@@ -191,7 +190,7 @@ def _compared(
 
 @in_own_modes
 def bootstrap(
-    problem: Problem | Recording,
+    problem: Problem | Recording | Images,
     resamples: int = 200,
     key: Key[Array, ""] | int = 0,
     *,
@@ -201,7 +200,7 @@ def bootstrap(
     """Calibrate samples of the used images that are drawn with replacement.
 
     Args:
-        problem: one problem or a recording.
+        problem: one problem, a recording, or one set of images.
         resamples: how many draws.
         key: of the draws, or a seed; draw k is fold_in(key, k).
         result: the calibration of all images, if it exists already: by the same method, with the
@@ -352,7 +351,7 @@ def _full_calibration(
 
 
 def _one_problem(
-    problem: Problem | Recording, arguments: dict[str, Any], name: str
+    problem: Problem | Recording | Images, arguments: dict[str, Any], name: str
 ) -> tuple[Problem, SolvePlan, dict[str, Any]]:
     """One problem with its bounds, how it is solved, and the arguments without the bounds.
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jaxcal.model.unknowns import unknown_names
 from jaxcal.runtime.arrays import is_traced
 from jaxcal.solvers.closed_form.single import ClosedForm, solve_problem
 
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 def calibrate_closed_form(
     problem: Problem | Recording | Images | Sequence[Problem | Recording | Images],
     *,
-    estimate: str | tuple[str, ...] = (),
+    estimate: str | Sequence[str] = (),
 ) -> ClosedForm:
     """Conventional calibration (Eq. 7) in closed form, with a certificate.
 
@@ -41,8 +42,7 @@ def calibrate_closed_form(
     Raises:
         InputError: other names in ``estimate``, data that cannot be used, fewer than 4 images.
     """
-    if isinstance(estimate, str):
-        estimate = (estimate,)
+    names = unknown_names(estimate)
     if isinstance(problem, list | tuple):
         from jaxcal.data.problem import as_batch
 
@@ -50,5 +50,5 @@ def calibrate_closed_form(
     if np.ndim(getattr(problem, "mask", ())) > 1 or is_traced(problem):
         from jaxcal.solvers.closed_form.batch import solve_batch
 
-        return solve_batch(problem, tuple(estimate))  # pyright: ignore[reportArgumentType]
-    return solve_problem(problem, estimate)  # pyright: ignore[reportArgumentType]
+        return solve_batch(problem, names)  # pyright: ignore[reportArgumentType]
+    return solve_problem(problem, names)  # pyright: ignore[reportArgumentType]
