@@ -204,6 +204,22 @@ def test_what_the_pieces_cannot_take_is_said_in_a_sentence():
     for call, said in (
         (lambda: backend.initial_fit(batch), "takes one problem"),
         (lambda: backend.ImagePlanes.of(one), "a batch with one leading axis"),
+        *(
+            (
+                lambda count=count, sigma=sigma: backend.minimise(
+                    backend.Iterate.of(
+                        jax.tree.map(lambda a: jnp.stack([a] * count), somewhere), backend.RIGID
+                    ),
+                    backend.Points(sigma),
+                    backend.ImagePlanes.of(batch),
+                ),
+                f"{name} must be of 2 problems",
+            )
+            for name, count, sigma in (
+                ("start", 1, jnp.ones((3, 2))),
+                ("sigma", 2, jnp.ones((3, 3))),
+            )
+        ),
         (
             lambda: backend.channel_residual(somewhere, one),
             "the problem has no times of flight",
