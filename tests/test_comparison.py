@@ -56,6 +56,9 @@ def test_results_are_compared_as_their_transforms_are():
     first, second = (jaxcal.calibrate(each, "conventional") for each in recordings)
     millimetres = np.array([[0.0, 30.0], [10.0, 60.0]])
     found = compare_calibrations(first, second, millimetres)
+    one, alone = (compare_calibrations(first, second, millimetres[k]) for k in (0, slice(1)))
+    assert one.points.shape == (1, 2)
+    assert one.limit_mm == alone.limit_mm
     both = [each.image_transform() for each in (first, second)]
     stored = compare_calibrations(*both, millimetres)
     mixed = compare_calibrations(first, both[1], millimetres)

@@ -59,7 +59,7 @@ class Comparison:
 def compare_calibrations(
     first: Calibration | ImageTransform,
     second: Calibration | ImageTransform,
-    points: Float[np.ndarray, "m 2"],
+    points: Float[np.ndarray, "m 2"] | Float[np.ndarray, 2],
 ) -> Comparison:
     """Map the same image points by two calibrations of one probe, and compare.
 
@@ -69,7 +69,7 @@ def compare_calibrations(
     Args:
         first: a calibration, computed or from :func:`jaxcal.load_calibration`.
         second: another one; both take pixels, or both points in mm.
-        points: [u, v] of image points, px, or [lateral, range] in mm.
+        points: [u, v] of image points, px, or [lateral, range] in mm; also a single one, (2,).
 
     Raises:
         InputError: what is no calibration, a batch, one that must not be used, only one that takes
@@ -86,7 +86,7 @@ def compare_calibrations(
             "cannot be given to both"
         )
     one, other = first.apply(points), second.apply(points)
-    points = np.asarray(points, float)
+    points = np.atleast_2d(np.asarray(points, float))
     apart = np.linalg.norm(one.points - other.points, axis=1)
     variances = np.trace(one.covariance + other.covariance, axis1=1, axis2=2)
     limit = np.nan

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jaxcal.data.problem import Problem, as_batch, check_shapes
 from jaxcal.model.unknowns import unknown_names
 from jaxcal.runtime.arrays import is_traced
 from jaxcal.solvers.closed_form.single import ClosedForm, solve_problem
@@ -13,7 +14,6 @@ from jaxcal.solvers.closed_form.single import ClosedForm, solve_problem
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from jaxcal.data.problem import Problem
     from jaxcal.data.recording import Images, Recording
 
 
@@ -44,9 +44,9 @@ def calibrate_closed_form(
     """
     names = unknown_names(estimate)
     if isinstance(problem, list | tuple):
-        from jaxcal.data.problem import as_batch
-
         problem = as_batch(problem, "jaxcal.calibrate_closed_form")
+    if isinstance(problem, Problem):
+        check_shapes(problem)
     if np.ndim(getattr(problem, "mask", ())) > 1 or is_traced(problem):
         from jaxcal.solvers.closed_form.batch import solve_batch
 
