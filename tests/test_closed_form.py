@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 import jaxcal
 from jaxcal.io.text import read_crosswire
 from jaxcal.report.certified import certificate_record, certificate_words
+from jaxcal.solvers.closed_form.batch import solve_batch
 from jaxcal.solvers.closed_form.reduced_objective import CONSTRAINTS, image_data, reduce
 from jaxcal.solvers.closed_form.rotation_relaxation import lower_bound
 from jaxcal.solvers.closed_form.single import solve
@@ -362,6 +363,22 @@ def test_what_cannot_be_asked_for():
     broken = dataclasses.replace(problem, measurements=problem.measurements.at[4].set(np.nan))
     with pytest.raises(jaxcal.InputError, match="measurements of image 4"):
         jaxcal.calibrate_closed_form(broken)
+    with pytest.raises(jaxcal.InputError, match="outside of jit"):
+        jax.jit(lambda given: jaxcal.certify(given, np.eye(4)).gap_mm2)(problem)
+
+
+def test_names_to_estimate_are_taken_as_by_calibrate():
+    images = drawn(1, 8)
+    named = jaxcal.calibrate_closed_form(images, estimate=("sound-speed",))
+    listed = jaxcal.calibrate_closed_form(images, estimate=["sound-speed"])
+    assert named.sound_speed_factor == listed.sound_speed_factor != 1
+    proof = jaxcal.certify(
+        images,
+        named.image_to_probe,
+        sound_speed_factor=named.sound_speed_factor,
+        estimate="sound-speed",
+    )
+    assert proof.certified
 
 
 def test_the_relaxation_proves_a_bound_wherever_it_stops():
@@ -383,14 +400,15 @@ def problems_of(images: list[jaxcal.Images]) -> jaxcal.Problem:
     return jaxcal.stack([jaxcal.Problem.from_recording(each) for each in images])
 
 
-def test_batches_give_the_same_answers():
+@pytest.mark.parametrize("few", [0, 12])
+def test_batches_give_the_same_answers(few):
     """Five images: some of these problems need the relaxation, which batches fall back on."""
     images = [drawn(seed, 5, noise=[0.5, 10.0][seed % 2], offset=5.0) for seed in range(12)]
     problems = jax.tree.map(np.array, problems_of(images))
     problems.measurements[3, 2] = problems.measurements[4, 0] = np.nan
     problems.mask[4, 0] = 0.0
     shaped = jax.tree.map(lambda leaf: leaf.reshape(3, 4, *leaf.shape[1:]), problems)
-    answers = jaxcal.calibrate_closed_form(shaped)
+    answers = solve_batch(shaped, (), few=few)
     assert answers.image_to_probe.shape == (3, 4, 4, 4)
     assert answers.scale_mm_per_px is None
     relaxed = 0
@@ -409,6 +427,23 @@ def test_batches_give_the_same_answers():
                 getattr(answers, name)[place], getattr(alone, name), rtol=0, atol=1e-8
             )
     assert relaxed > 0
+
+
+def test_a_list_of_any_size_compiles_nothing():
+    compiled = []
+
+    def listen(event: str, duration_secs: float, **_: str | int) -> None:
+        compiled.extend([event] * ("backend_compile" in event))
+
+    lists = [[drawn(seed, images) for seed in range(count)] for count, images in ((2, 6), (3, 7))]
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        answers = [jaxcal.calibrate_closed_form(each) for each in lists]
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+    assert compiled == []
+    alone = jaxcal.calibrate_closed_form(lists[1][2])
+    np.testing.assert_array_equal(answers[1].image_to_probe[2], alone.image_to_probe)
 
 
 def test_callers_with_32_bits_get_64():

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 import jaxcal
 from jaxcal import ImageTransform, InputError, compare_calibrations
 from jaxcal.cli.main import main
+from jaxcal.runtime.arrays import map_arrays
 
 POINTS = np.array([[100.0, 300.0], [10, 10], [390, 10], [10, 490], [390, 490]])
 SCALE = np.array([0.1, 0.12])
@@ -48,6 +49,26 @@ def test_a_shift_and_a_turn_are_what_they_are():
     # About the axial axis, by the lateral position of 39 mm.
     assert found.apart_mm == pytest.approx([2 * 39.0 * np.sin(0.05)])
     assert found.rotation_deg == pytest.approx(np.degrees(0.1))
+
+
+def test_results_are_compared_as_their_transforms_are():
+    recordings = [jaxcal.simulate_recording(jaxcal.Protocol(images=8), seed) for seed in (1, 2)]
+    first, second = (jaxcal.calibrate(each, "conventional") for each in recordings)
+    millimetres = np.array([[0.0, 30.0], [10.0, 60.0]])
+    found = compare_calibrations(first, second, millimetres)
+    one, alone = (compare_calibrations(first, second, millimetres[k]) for k in (0, slice(1)))
+    assert one.points.shape == (1, 2)
+    assert one.limit_mm == alone.limit_mm
+    both = [each.image_transform() for each in (first, second)]
+    stored = compare_calibrations(*both, millimetres)
+    mixed = compare_calibrations(first, both[1], millimetres)
+    assert found.rms_mm == stored.rms_mm == mixed.rms_mm > 0
+    assert found.limit_mm == stored.limit_mm
+    with pytest.raises(InputError, match="first takes points in mm, memory pixels"):
+        compare_calibrations(first, ImageTransform(place(), SCALE), millimetres)
+    batch = map_arrays(lambda leaf: np.stack([leaf, leaf]), first)
+    with pytest.raises(InputError, match="take one of its calibrations"):
+        compare_calibrations(batch, first, millimetres)
 
 
 def test_nineteen_of_twenty_pairs_with_right_covariances_agree():

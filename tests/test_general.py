@@ -29,8 +29,47 @@ def test_rosenbrock():
     np.testing.assert_allclose(solution.value, [1, 1], atol=1e-10)
 
 
+def test_root_find_judges_the_answers_residuals():
+    """Its criterion is aux of the answer (which was that of the start), and ``atol`` (0)."""
+
+    def beside(unknowns, shift):
+        valley, along = banana(unknowns, None).values()
+        return jnp.stack([valley, along + shift]), {"sum": jnp.sum(unknowns)}
+
+    @jax.jit
+    def find(shift):
+        start = jnp.asarray([-1.2, 1.0])
+        return optx.root_find(beside, LevenbergMarquardt(), start, shift, has_aux=True, throw=False)
+
+    found = find(0.0)
+    assert found.result == optx.RESULTS.successful
+    np.testing.assert_allclose(found.value, [1, 1], atol=1e-10)
+    np.testing.assert_allclose(found.aux["sum"], 2, atol=1e-10)
+    np.testing.assert_allclose(jax.jacobian(lambda shift: find(shift).value)(0.0), [1, 2])
+
+
+def test_a_minimum_is_no_root():
+    def apart(unknown, args):
+        return 1e-3 * jnp.stack([unknown + 1, unknown - 1])
+
+    found = optx.root_find(apart, LevenbergMarquardt(), jnp.asarray(1.0), throw=False)
+    np.testing.assert_allclose(found.value, 0, atol=1e-9)
+    assert found.result == optx.RESULTS.nonlinear_max_steps_reached
+
+
+def test_the_tolerance_follows_the_dtype(noisy):
+    """In float32, a gradient cosine of 1e-10 cannot be met: four more steps ended the loop."""
+    start = {"size": jnp.ones((), jnp.float32), "rate": jnp.zeros((), jnp.float32)}
+    data = jnp.asarray(noisy[0], jnp.float32)
+    by_default = optx.least_squares(decay, LevenbergMarquardt(), start, data)
+    stated = optx.least_squares(decay, LevenbergMarquardt(tolerance=1e-4), start, data)
+    assert by_default.stats["num_steps"] == stated.stats["num_steps"]
+    wide = fitted(jnp.asarray(noisy[0])).value
+    np.testing.assert_allclose(by_default.value["rate"], wide["rate"], rtol=1e-3)
+
+
 def decay(unknowns, data):
-    time = jnp.linspace(0, 2, data.shape[0])
+    time = jnp.linspace(0, 2, data.shape[0], dtype=data.dtype)
     return unknowns["size"] * jnp.exp(-unknowns["rate"] * time) - data
 
 
@@ -165,6 +204,22 @@ def test_what_the_pieces_cannot_take_is_said_in_a_sentence():
     for call, said in (
         (lambda: backend.initial_fit(batch), "takes one problem"),
         (lambda: backend.ImagePlanes.of(one), "a batch with one leading axis"),
+        *(
+            (
+                lambda count=count, sigma=sigma: backend.minimise(
+                    backend.Iterate.of(
+                        jax.tree.map(lambda a: jnp.stack([a] * count), somewhere), backend.RIGID
+                    ),
+                    backend.Points(sigma),
+                    backend.ImagePlanes.of(batch),
+                ),
+                f"{name} must be of 2 problems",
+            )
+            for name, count, sigma in (
+                ("start", 1, jnp.ones((3, 2))),
+                ("sigma", 2, jnp.ones((3, 3))),
+            )
+        ),
         (
             lambda: backend.channel_residual(somewhere, one),
             "the problem has no times of flight",

@@ -13,6 +13,7 @@ import pytest
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
+from jaxcal import InputError
 from jaxcal.data.problem import Channels as Heard
 from jaxcal.data.problem import Problem
 from jaxcal.model import derivatives, unrolled
@@ -45,6 +46,8 @@ from jaxcal.solvers.normal_equations import accumulate, component_sums
 
 PROBLEMS, IMAGES, ELEMENTS, LEFT_OUT = 3, 11, 5, 4
 SIGMA = jnp.asarray(np.outer([0.3, 0.4, 1.5], [1.0, 0.7, 1.3]))
+SPEEDS, SPEED_SD, DELAY_SD = jnp.asarray([1450.0, 1500.0, 1540.0]), 15.0, 3e-7
+"""Nominal sound speeds, and the medium's prior; m/s, s."""
 GATE = jnp.asarray([1.0, 0.0, 1.0])
 """Second derivatives in two problems, none in the one between."""
 
@@ -165,7 +168,8 @@ def case(drawn, name: str) -> tuple[Iterate, Any, ImagePlanes, MediumPrior | Non
     images = ImagePlanes.of(problems, channels=name == "channels")
     medium = None
     if name in ("points", "channels"):
-        medium = MediumPrior(jnp.asarray([[0.01] * PROBLEMS, [0.4] * PROBLEMS]), blocks)
+        of_speed = replace(problems, sound_speed=SPEEDS)
+        medium = MediumPrior.of(of_speed, blocks, sound_speed_sd=SPEED_SD, delay_sd=DELAY_SD)
     return Iterate.of(near, blocks), make(images), images, medium
 
 
@@ -187,7 +191,8 @@ def whitened(step, local, place: Iterate, observation, images: ImagePlanes, medi
             found.append(images.mask[..., None] * wide / sd[:, None, None])
     if medium is not None:
         speed, delay = moved.further("sound-speed"), moved.further("delay")
-        known = jnp.stack([jnp.log(speed[0]), delay[0]]) / medium.sd
+        delay_s = delay[0] / (1e3 * SPEEDS)
+        known = jnp.stack([jnp.log(speed[0]) * SPEEDS / SPEED_SD, delay_s / DELAY_SD])
         found.append(jnp.zeros((PROBLEMS, IMAGES, 2)).at[:, 0].set(known.T))
     return jnp.concatenate(found, axis=-1)
 
@@ -274,6 +279,20 @@ def test_sums_are_the_derivatives_of_the_cost(drawn, name):
     assert np.abs(exact - newton).max() > 1e-5 * np.abs(newton).max()
     if isinstance(observation, LocalUnknown):
         assert_close(normal.diagonal(), squares, 1e-12)
+
+
+def test_a_prior_of_the_medium_is_that_of_the_free_unknowns(drawn):
+    problems, near = drawn
+    assert MediumPrior.of(problems, (*RIGID, "scale")) is None
+    medium = MediumPrior.of(problems, (*RIGID, "delay"))
+    with pytest.raises(InputError, match=r"not for .*'sound-speed'"):
+        medium.deviations(Iterate.of(near, (*RIGID, "sound-speed")))
+    for given in (-1.0, np.nan):
+        with pytest.raises(InputError, match="delay_sd must be"):
+            MediumPrior.of(problems, (*RIGID, "delay"), delay_sd=given)
+    with pytest.raises(InputError, match="one leading axis"):
+        MediumPrior.of(jax.tree.map(lambda leaf: leaf[0], problems), RIGID)
+    np.testing.assert_array_equal(near.matrix()[1, :3, 3], near.translation[1])
 
 
 @pytest.mark.parametrize("name", ["points", "own covariances", "on a line", "channels"])

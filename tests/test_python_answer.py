@@ -332,6 +332,10 @@ for call, *given in (
     (lambda bound: LiveCalibration().put(np.eye(4), points[0], bound), "one"),
     (jaxcal.compare_calibrations, "first.json", "second.json", points),
     (jaxcal.compare_calibrations, mapping, mapping, [[0.0, 20.0, 1.0]]),
+    (lambda names: jaxcal.calibrate_closed_form(problem, estimate=names), 3),
+    *((lambda mask, data=data: jaxcal.calibrate_closed_form(
+        dataclasses.replace(data, mask=mask)), mask)
+      for data, mask in ((problem, np.ones(5)), (jaxcal.stack([problem]), np.ones((1, 5))))),
 ):
     try:
         call(*given)
@@ -343,7 +347,7 @@ for call, *given in (
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stderr == ""
     lines = done.stdout.splitlines()
-    assert len(lines) == 193
+    assert len(lines) == 196
     assert lines[0].startswith("jaxcal.calibrate takes a problem, not a path: ")
     assert lines[3].startswith("jaxcal.calibrate_batch takes a problem or a recording, not int: ")
     assert lines[4] == "points must have shape (..., 2), not (1, 3)"

@@ -79,6 +79,15 @@ def test_a_recording_says_what_it_holds_without_its_arrays():
     assert "array" not in said
 
 
+def test_a_problem_of_arrays_has_the_range_of_row_zero():
+    given = arrays()
+    made = jaxcal.Problem.from_arrays(**given, face_offset_mm=4.0)
+    from_images = jaxcal.Problem.from_recording(jaxcal.make_images(**given, face_offset_mm=4.0))
+    assert made.face_offset == from_images.face_offset == 4.0
+    with pytest.raises(InputError, match="face_offset_mm"):
+        jaxcal.Problem.from_arrays(**given, face_offset_mm=np.nan)
+
+
 def test_numbers_of_frames_are_whole():
     given = arrays()
     numbers = np.array([0, 2, 3, *range(9, 18)])

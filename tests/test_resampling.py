@@ -18,6 +18,10 @@ import jaxcal
 from jaxcal.calibration.resampling import (
     _compared,
     _from_full_image,
+    _placed,
+    _scatter,
+    _used,
+    _with_rows,
     bootstrap,
     cross_validate,
     relative_twist,
@@ -28,6 +32,7 @@ from jaxcal.diagnostics import metrics
 from jaxcal.model.distributions import FAMILIES, OffsetLaw
 from jaxcal.model.image_points import distance
 from jaxcal.result.calibration import Medium
+from jaxcal.runtime.arrays import map_arrays
 
 CONVENTIONAL: dict[str, Any] = {"method": "conventional"}
 COUNT = 20
@@ -218,6 +223,30 @@ def test_log_density_is_that_of_the_noise_model(data, whole):
         expected = multivariate_normal.logpdf(error[:2], cov=seen)
         expected += norm.logpdf(error[2], mean[fold[image]], np.hypot(sigma[2], tau))
         assert float(found.log_density[image]) == pytest.approx(expected, rel=1e-9)
+
+
+def test_beside_the_calibrations_nothing_is_compiled(data, whole):
+    """Of eight programs or more, each new number of images, folds or resamples needed all anew."""
+    compiled = []
+
+    def listen(event: str, duration_secs: float, **_: str | int) -> None:
+        compiled.extend([event] * ("backend_compile" in event))
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        used, _ = _used(data, whole)
+        rows = np.arange(3 * COUNT).reshape(3, COUNT) % 7
+        drawn = _placed(_with_rows(used, rows, np.ones((3, COUNT))), data)
+        fits = map_arrays(lambda leaf: np.stack([leaf] * 3), replace(whole, problem=None))
+        seen = _compared(used, whole, replace(fits, problem=None), np.arange(COUNT) % 3)
+        scatter = _scatter(used, whole, fits)
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+    assert compiled == []
+    np.testing.assert_array_equal(drawn.poses[2], np.asarray(data.poses)[rows[2]])
+    assert float(seen.rms) == pytest.approx(float(whole.rms), rel=1e-9)
+    assert not np.any(seen.moved)
+    assert not scatter.spread.any()
 
 
 @pytest.mark.slow

@@ -22,7 +22,7 @@ from jaxcal.calibration.conventional import closed_form_answer
 from jaxcal.calibration.dependence import independent
 from jaxcal.calibration.serial_correlation import widened
 from jaxcal.data.problem import Problem, as_batch, as_problem, check_shapes, check_values
-from jaxcal.data.recording import MINIMUM_IMAGES, Recording
+from jaxcal.data.recording import MINIMUM_IMAGES, Images, Recording
 from jaxcal.model.distributions import Shape
 from jaxcal.model.unknowns import (
     DELAY_SD_S,
@@ -31,6 +31,7 @@ from jaxcal.model.unknowns import (
     RIGID,
     SOUND_SPEED_SD_M_S,
     TABLE,
+    unknown_names,
     with_prior,
 )
 from jaxcal.result.calibration import Calibration
@@ -80,7 +81,7 @@ class Request:
     method: Method = "joint"
     prior: PriorName = "auto"
     max_elevation: float | np.ndarray | Array | None = None
-    sigma: tuple[float, ...] | np.ndarray | Array | None = None
+    sigma: Sequence[float] | np.ndarray | Array | None = None
     tracker_sd: float | Array | None = None
     estimate: tuple[str, ...] = ()
     data: Data = "auto"
@@ -98,7 +99,7 @@ def _taking_recordings(function: Callable[P, Calibration]) -> Callable[P, Calibr
     """
 
     @wraps(function)
-    def taking(problem: Problem | Recording, *args: Any, **kwargs: Any) -> Calibration:
+    def taking(problem: Problem | Recording | Images, *args: Any, **kwargs: Any) -> Calibration:
         found = function(as_problem(problem, "jaxcal.calibrate"), *args, **kwargs)  # pyright: ignore[reportCallIssue]
         probe = problem.probe if isinstance(problem, Recording) else None
         return found if probe is None else replace(found, probe=probe)
@@ -109,14 +110,14 @@ def _taking_recordings(function: Callable[P, Calibration]) -> Callable[P, Calibr
 @_taking_recordings
 @in_own_modes
 def calibrate(
-    problem: Problem | Recording,
+    problem: Problem | Recording | Images,
     method: Method = "joint",
     prior: PriorName = "auto",
     *,
     max_elevation: float | np.ndarray | Array | None = None,
-    sigma: tuple[float, ...] | np.ndarray | Array | None = None,
+    sigma: Sequence[float] | np.ndarray | Array | None = None,
     tracker_sd: float | Array | None = None,
-    estimate: str | tuple[str, ...] = (),
+    estimate: str | Sequence[str] = (),
     data: Data = "auto",
     sound_speed_sd: float | Array = SOUND_SPEED_SD_M_S,
     delay_sd: float | Array = DELAY_SD_S,
@@ -126,7 +127,8 @@ def calibrate(
     """Find X, the target and the elevational offsets; no starting guess is needed.
 
     Args:
-        problem: one problem (a batch is handed to :func:`calibrate_batch`), or a recording.
+        problem: one problem (a batch is handed to :func:`calibrate_batch`), a recording, or
+            one set of images.
         method: ``joint`` (X, c and every offset together), ``alternating`` (the paper's Fig. 4) or
             ``conventional`` (Eq. 7, every target in the plane). All can be differentiated, but the
             alternation only with tolerances so small that it reaches the minimum.
@@ -228,14 +230,14 @@ def _solve_alone(problem: Problem, given: Given, plan: SolvePlan) -> Calibration
 @importing_jax
 @in_own_modes
 def calibrate_batch(
-    problems: Problem | Sequence[Problem | Recording],
+    problems: Problem | Sequence[Problem | Recording | Images],
     method: Method = "joint",
     prior: PriorName = "auto",
     *,
     max_elevation: float | np.ndarray | Array | None = None,
-    sigma: tuple[float, ...] | np.ndarray | Array | None = None,
+    sigma: Sequence[float] | np.ndarray | Array | None = None,
     tracker_sd: float | Array | None = None,
-    estimate: str | tuple[str, ...] = (),
+    estimate: str | Sequence[str] = (),
     data: Data = "auto",
     sound_speed_sd: float | Array = SOUND_SPEED_SD_M_S,
     delay_sd: float | Array = DELAY_SD_S,
@@ -254,8 +256,8 @@ def calibrate_batch(
     rounding, results do not depend on this.
 
     Args:
-        problems: leading axes of any shape; see :func:`jaxcal.stack`. A list of problems or
-            recordings is stacked; all must have the same number of images.
+        problems: leading axes of any shape; see :func:`jaxcal.stack`. A list of problems,
+            recordings or sets of images is stacked; all must have the same number of images.
         method: as for :func:`calibrate`.
         prior: as for :func:`calibrate`.
         max_elevation: as for :func:`calibrate`.
@@ -299,17 +301,6 @@ def calibrate_batch(
     from jaxcal.calibration.engine import solve_batch
 
     return solve_batch(problems, given, plan, chunk)
-
-
-def unknown_names(estimate: Any) -> tuple[str, ...]:
-    """Names of further unknowns as a tuple; a text may hold one name or several with commas."""
-    if isinstance(estimate, str):
-        return tuple(name.strip() for name in estimate.split(","))
-    if estimate is None:
-        return ()
-    if not isinstance(estimate, Iterable):
-        raise InputError(f"estimate must be names of unknowns, not {shown(estimate)}")
-    return tuple(estimate)
 
 
 def options_of(options: Options | None) -> Options:

@@ -6,20 +6,21 @@ each image moves the answer (its influence). The bootstrap draws the images anew
 and shows how the answer scatters (reproducibility).
 
 Both run :func:`jaxcal.calibrate_batch` on masks or rows of the same problem: pure functions of
-arrays (and a key), which work under jit.
+arrays (and a key), which work under jit. Outside of it the rest is computed by numpy, since JAX
+would compile it for every number of images, folds and resamples.
 """
 
 from __future__ import annotations
 
 from dataclasses import fields, replace
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from jaxcal import InputError
 from jaxcal.calibration.calibrate import (
@@ -27,26 +28,26 @@ from jaxcal.calibration.calibrate import (
     calibrate,
     calibrate_batch,
     prepare,
-    unknown_names,
 )
 from jaxcal.calibration.dependence import independent
+from jaxcal.calibration.engine import as_jax_holds
 from jaxcal.data.problem import Problem, as_problem
-from jaxcal.data.recording import MINIMUM_IMAGES, Recording
+from jaxcal.data.recording import MINIMUM_IMAGES, Images, Recording
 from jaxcal.diagnostics.image_errors import noise_covariance
 from jaxcal.diagnostics.intervals import range_of_row_zero
 from jaxcal.diagnostics.metrics import calibration_reproducibility
-from jaxcal.model.observations import factor_of
-from jaxcal.model.parameters import Parameters
-from jaxcal.model.residuals import measured_points, measurement_residual
 from jaxcal.model.thresholds import MAD
-from jaxcal.model.unknowns import split_further
+from jaxcal.model.unknowns import Values, measured, split_further, unknown_names
 from jaxcal.result.calibration import Calibration
-from jaxcal.runtime.arrays import each_image, is_traced
+from jaxcal.runtime.array_types import AnyArray
+from jaxcal.runtime.arrays import array_module, each_image, is_traced, map_arrays
 from jaxcal.runtime.given_values import LARGEST_SEED, check_key, check_made, whole_number
 from jaxcal.runtime.jax_modes import in_own_modes
 from jaxcal.runtime.messages import shown
 from jaxcal.solvers import dense
 from jaxcal.solvers.plan import SolvePlan
+
+T = TypeVar("T")
 
 LARGEST_RESAMPLES = 100_000
 """Most resamples of a bootstrap."""
@@ -81,19 +82,19 @@ class CrossValidation(eqx.Module):
             that the measured points fill.
     """
 
-    residual: Float[Array, "n 3"]
-    cloud: Float[Array, "n 3"]
-    precision: Float[Array, ""]
-    rms: Float[Array, ""]
-    log_density: Float[Array, " n"]
-    moved: Float[Array, "n 6"]
-    influence: Float[Array, " n"]
-    image_to_probe: Float[Array, "folds 4 4"]
-    converged: Float[Array, " folds"]
-    fold_cost: Float[Array, " n"]
-    mask: Float[Array, " n"]
-    image_moved: Float[Array, " n"]
-    image_points: Float[Array, "m 2"]
+    residual: Float[AnyArray, "n 3"]
+    cloud: Float[AnyArray, "n 3"]
+    precision: Float[AnyArray, ""]
+    rms: Float[AnyArray, ""]
+    log_density: Float[AnyArray, " n"]
+    moved: Float[AnyArray, "n 6"]
+    influence: Float[AnyArray, " n"]
+    image_to_probe: Float[AnyArray, "folds 4 4"]
+    converged: Float[AnyArray, " folds"]
+    fold_cost: Float[AnyArray, " n"]
+    mask: Float[AnyArray, " n"]
+    image_moved: Float[AnyArray, " n"]
+    image_points: Float[AnyArray, "m 2"]
 
 
 class Bootstrap(eqx.Module):
@@ -110,16 +111,16 @@ class Bootstrap(eqx.Module):
             that the measured points fill.
     """
 
-    image_to_probe: Float[Array, "k 4 4"]
-    converged: Float[Array, " k"]
-    spread: Float[Array, 6]
-    reproducibility: Float[Array, " m"]
-    image_points: Float[Array, "m 2"]
+    image_to_probe: Float[AnyArray, "k 4 4"]
+    converged: Float[AnyArray, " k"]
+    spread: Float[AnyArray, 6]
+    reproducibility: Float[AnyArray, " m"]
+    image_points: Float[AnyArray, "m 2"]
 
 
 @in_own_modes
 def cross_validate(
-    problem: Problem | Recording,
+    problem: Problem | Recording | Images,
     *,
     folds: int | None = None,
     result: Calibration | None = None,
@@ -128,7 +129,7 @@ def cross_validate(
     """Hold out each image (or fold of images) in turn, and calibrate from the others.
 
     Args:
-        problem: one problem or a recording.
+        problem: one problem, a recording, or one set of images.
         folds: image i belongs to fold i mod folds; by default every image is a fold of its own.
         result: the calibration of all images, if it exists already: by the same method, with the
             same prior, data and unknowns. Images that it left out as outliers are neither used nor
@@ -145,48 +146,44 @@ def cross_validate(
     problem, plan, arguments = _one_problem(problem, arguments, "jaxcal.cross_validate")
     count = problem.images
     folds = count if folds is None else whole_number("folds", folds, 2, count)
-    result = _full_calibration(problem, result, plan, arguments)
-    problem = replace(problem, mask=jnp.asarray(result.mask, problem.mask.dtype))
+    given, result = problem, _full_calibration(problem, result, plan, arguments)
+    problem, xp = _used(problem, result)
     fold = np.arange(count) % folds
-    rest = jnp.asarray(fold[None, :] != np.arange(folds)[:, None], problem.mask.dtype)
+    rest = fold != np.arange(folds)[:, None]
     _check_remaining(problem.mask, rest)
-    many = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (folds, *leaf.shape)), problem)
+    many = map_arrays(lambda leaf: xp.broadcast_to(leaf, (folds, *leaf.shape)), problem)
     # Outliers were found with all images.
     arguments["robust"] = False
-    fits = calibrate_batch(replace(many, mask=problem.mask * rest), **arguments)
-    return _compared(problem, result, fits, fold)
+    fits = calibrate_batch(_placed(replace(many, mask=problem.mask * rest), given), **arguments)
+    compared = _compared if xp is np else jax.jit(_compared)
+    return _placed(compared(problem, result, fits, fold), given)
 
 
-@jax.jit
 def _compared(
-    problem: Problem, result: Calibration, fits: Calibration, fold: Array
+    problem: Problem, result: Calibration, fits: Calibration, fold: Int[AnyArray, " n"]
 ) -> CrossValidation:
-    """The calibrations of the folds against that of all images, and against the held-out images.
-
-    As one program: compiled operation by operation it takes several times as long.
-    """
-    held = jax.tree.map(lambda leaf: leaf[fold], fits)
+    """The calibrations of the folds against that of all images, and against the held-out images."""
+    problem, result, fits, xp = _plain(problem, result, fits)
+    held = map_arrays(lambda leaf: leaf[fold], replace(fits, problem=None))
     errors, cloud = _held_out_errors(held, problem)
     mask = problem.mask
-    used = jnp.sum(mask)
-    mean = jnp.sum(mask[:, None] * cloud, axis=0) / used
-    moved = jax.vmap(relative_twist, (None, 0))(
-        jnp.asarray(result.image_to_probe), held.image_to_probe
-    )
-    moved = mask[:, None] * moved
+    used = xp.sum(mask)
+    mean = xp.sum(mask[:, None] * cloud, axis=0) / used
+    whole = result.image_to_probe
+    moved = mask[:, None] * relative_twist(whole, held.image_to_probe)
     points = _box_points(problem, result)
-    whole = jnp.asarray(result.image_to_probe)
     image_moved = _rms_distance(_from_full_image(held, result, problem), whole, points) * mask
+    noise = noise_covariance(fits, problem)[fold, np.arange(len(fold))]
     return CrossValidation(
         residual=errors,
         cloud=cloud,
-        precision=jnp.sqrt(jnp.sum(mask[:, None] * (cloud - mean) ** 2) / (used - 1)),
-        rms=jnp.sqrt(jnp.sum(cloud**2) / used),
-        log_density=mask * _log_density(held, problem, errors),
+        precision=xp.asarray(xp.sqrt(xp.sum(mask[:, None] * (cloud - mean) ** 2) / (used - 1))),
+        rms=xp.asarray(xp.sqrt(xp.sum(cloud**2) / used)),
+        log_density=mask * _log_density(held, noise, errors),
         moved=moved,
-        influence=_length_in_sds(moved, jnp.asarray(result.covariance)),
-        image_to_probe=jnp.asarray(fits.image_to_probe),
-        converged=jnp.asarray(fits.converged, mask.dtype),
+        influence=_length_in_sds(moved, result.covariance),
+        image_to_probe=fits.image_to_probe,
+        converged=xp.asarray(fits.converged, mask.dtype),
         fold_cost=held.cost,
         mask=mask,
         image_moved=image_moved,
@@ -196,7 +193,7 @@ def _compared(
 
 @in_own_modes
 def bootstrap(
-    problem: Problem | Recording,
+    problem: Problem | Recording | Images,
     resamples: int = 200,
     key: Key[Array, ""] | int = 0,
     *,
@@ -206,7 +203,7 @@ def bootstrap(
     """Calibrate samples of the used images that are drawn with replacement.
 
     Args:
-        problem: one problem or a recording.
+        problem: one problem, a recording, or one set of images.
         resamples: how many draws.
         key: of the draws, or a seed; draw k is fold_in(key, k).
         result: the calibration of all images, if it exists already: by the same method, with the
@@ -227,73 +224,78 @@ def bootstrap(
         root = key
     else:
         root = jax.random.key(whole_number("key", key, 0, LARGEST_SEED))
-    result = _full_calibration(problem, result, plan, arguments)
-    mask = jnp.asarray(result.mask, problem.mask.dtype)
-    problem = replace(problem, mask=mask)
-    rows = _rows(root, mask, resamples)
+    given, result = problem, _full_calibration(problem, result, plan, arguments)
+    problem, xp = _used(problem, result)
+    uniform = _uniform(root, problem.images, resamples, problem.mask.dtype)
+    cumulative = xp.cumsum(problem.mask)
+    # The first image at which the count of used images exceeds the draw is always a used one.
+    chosen = xp.searchsorted(cumulative, xp.asarray(uniform) * cumulative[-1], side="right")
+    rows = xp.minimum(chosen, problem.images - 1)
     # Each draw has as many images as were used, since the mask leaves out the other rows.
+    mask = xp.broadcast_to(problem.mask, rows.shape)
     arguments["robust"] = False
-    fits = calibrate_batch(_with_rows(problem, rows, mask), **arguments)
-    return _scatter(problem, result, fits)
+    fits = calibrate_batch(_placed(_with_rows(problem, rows, mask), given), **arguments)
+    scatter = _scatter if xp is np else jax.jit(_scatter)
+    return _placed(scatter(problem, result, fits), given)
 
 
-@partial(jax.jit, static_argnums=2)
-def _rows(root: Key[Array, ""], mask: Float[Array, " n"], resamples: int) -> Int[Array, "k n"]:
-    """Used images drawn with replacement, for each resample."""
-    cumulative = jnp.cumsum(mask)
-
-    def draw(index: Array) -> Array:
-        uniform = jax.random.uniform(jax.random.fold_in(root, index), mask.shape, mask.dtype)
-        # The first image at which the count of used images exceeds the draw is always a used one.
-        chosen = jnp.searchsorted(cumulative, uniform * cumulative[-1], side="right")
-        return jnp.minimum(chosen, mask.shape[0] - 1)
-
-    return jax.vmap(draw)(jnp.arange(resamples))
+@partial(jax.jit, static_argnums=(1, 2, 3))
+def _uniform(root: Key[Array, ""], images: int, resamples: int, dtype: Any) -> Float[Array, "k n"]:
+    """Uniform random numbers, those of a resample from a key of its own."""
+    return jax.vmap(
+        lambda index: jax.random.uniform(jax.random.fold_in(root, index), (images,), dtype)
+    )(jnp.arange(resamples))
 
 
-@jax.jit
 def _scatter(problem: Problem, result: Calibration, fits: Calibration) -> Bootstrap:
     """How the calibrations of the resamples scatter about that of all images."""
-    converged = jnp.asarray(fits.converged, problem.mask.dtype)
-    whole = jnp.asarray(result.image_to_probe)
-    drawn = jnp.asarray(fits.image_to_probe)
-    moved = jax.vmap(relative_twist, (None, 0))(whole, drawn)
-    moved = jnp.where(converged[:, None] > 0, jnp.abs(moved), jnp.nan)
+    problem, result, fits, xp = _plain(problem, result, fits)
+    converged = xp.asarray(fits.converged, problem.mask.dtype)
+    whole, drawn = result.image_to_probe, fits.image_to_probe
+    moved = xp.where(converged[:, None] > 0, xp.abs(relative_twist(whole, drawn)), xp.nan)
+    # Where none converged, numpy would warn.
+    unknown = xp is np and not converged.any()
+    spread = moved[0] if unknown else xp.nanmedian(moved, axis=0)
     points = _box_points(problem, result)
     # A resample that did not converge gets the X of all images, and adds nothing to the scatter.
     found = _from_full_image(fits, result, problem)
-    transforms = jnp.where(converged[:, None, None] > 0, found, whole)
-    share = jnp.maximum(jnp.mean(converged), 1e-9)
+    transforms = xp.where(converged[:, None, None] > 0, found, whole)
+    share = xp.maximum(xp.mean(converged), 1e-9)
     return Bootstrap(
         image_to_probe=drawn,
         converged=converged,
-        spread=MAD * jnp.nanmedian(moved, axis=0),
-        reproducibility=jnp.asarray(calibration_reproducibility(transforms, points)) / share,
+        spread=MAD * spread,
+        reproducibility=xp.asarray(calibration_reproducibility(transforms, points)) / share,
         image_points=points,
     )
 
 
-def relative_twist(first: Float[Array, "4 4"], second: Float[Array, "4 4"]) -> Float[Array, 6]:
+def relative_twist(
+    first: Float[AnyArray, "4 4"], second: Float[AnyArray, "*k 4 4"]
+) -> Float[AnyArray, "*k 6"]:
     """[v, omega] that take the first transform to the second: first Exp([v, omega]), mm and rad.
 
     It is exact for v. For omega the error is of third order, since a calibration moves by fractions
     of a degree.
     """
-    rotation = first[:3, :3].T @ second[:3, :3]
-    shift = first[:3, :3].T @ (second[:3, 3] - first[:3, 3])
-    turn = 0.5 * jnp.stack(
+    xp = array_module(first, second)
+    back = first[:3, :3].T
+    rotation = back @ second[..., :3, :3]
+    shift = (second[..., :3, 3] - first[:3, 3]) @ back.T
+    turn = 0.5 * xp.stack(
         [
-            rotation[2, 1] - rotation[1, 2],
-            rotation[0, 2] - rotation[2, 0],
-            rotation[1, 0] - rotation[0, 1],
-        ]
+            rotation[..., 2, 1] - rotation[..., 1, 2],
+            rotation[..., 0, 2] - rotation[..., 2, 0],
+            rotation[..., 1, 0] - rotation[..., 0, 1],
+        ],
+        axis=-1,
     )
-    return jnp.concatenate([shift, turn])
+    return xp.concatenate([shift, turn], axis=-1)
 
 
 def _from_full_image(
     fits: Calibration, result: Calibration, problem: Problem
-) -> Float[Array, "k 4 4"]:
+) -> Float[AnyArray, "k 4 4"]:
     """Transforms from the image of the full calibration, in that calibration's mm, to the probe.
 
     Another calibration has pixels of another size, another sound speed and another delay, and puts
@@ -301,24 +303,30 @@ def _from_full_image(
     """
     origin, speed = range_of_row_zero(replace(result, problem=problem))
     origins, speeds = range_of_row_zero(replace(fits, problem=problem))
-    lateral, axial = jnp.ones_like(speeds), jnp.asarray(speeds / speed)
+    xp = array_module(speed, speeds)
+    lateral, axial = xp.ones_like(speeds), speeds / speed
     if fits.scale_mm_per_px is not None and result.scale_mm_per_px is not None:
-        ratio = jnp.asarray(fits.scale_mm_per_px) / jnp.asarray(result.scale_mm_per_px)
+        ratio = fits.scale_mm_per_px / result.scale_mm_per_px
         lateral, axial = ratio[:, 0], axial * ratio[:, 1]
-    x = jnp.asarray(fits.image_to_probe)
-    stretch = jnp.stack([lateral, jnp.ones_like(axial), axial], axis=1)
-    shift = (origins - axial * origin)[:, None] * x[:, :3, 2]
-    return (x.at[:, :3, :3].multiply(stretch[:, None])).at[:, :3, 3].add(shift)
+    x = fits.image_to_probe
+    # Columns of the rotation are stretched; the last column is the translation.
+    stretch = xp.stack([lateral, xp.ones_like(axial), axial, xp.ones_like(axial)], axis=1)
+    shift = (origins - axial * origin)[:, None] * x[:, :, 2]
+    last = xp.asarray([0.0, 0.0, 0.0, 1.0])
+    return x * stretch[:, None] + shift[..., None] * last
 
 
 def _rms_distance(
-    transforms: Float[Array, "k 4 4"], whole: Float[Array, "4 4"], points: Float[Array, "m 2"]
-) -> Float[Array, " k"]:
+    transforms: Float[AnyArray, "k 4 4"],
+    whole: Float[AnyArray, "4 4"],
+    points: Float[AnyArray, "m 2"],
+) -> Float[AnyArray, " k"]:
     """Root mean square distance of image points under each transform from those under ``whole``."""
-    zero, one = jnp.zeros_like(points[:, 0]), jnp.ones_like(points[:, 0])
-    there = jnp.stack([points[:, 0], zero, points[:, 1], one])
+    xp = array_module(transforms, whole, points)
+    zero, one = xp.zeros_like(points[:, 0]), xp.ones_like(points[:, 0])
+    there = xp.stack([points[:, 0], zero, points[:, 1], one])
     moved = ((transforms - whole) @ there)[:, :3]
-    return jnp.sqrt(jnp.mean(jnp.sum(moved**2, axis=1), axis=1))
+    return xp.sqrt(xp.mean(xp.sum(moved**2, axis=1), axis=1))
 
 
 def _full_calibration(
@@ -349,7 +357,7 @@ def _full_calibration(
 
 
 def _one_problem(
-    problem: Problem | Recording, arguments: dict[str, Any], name: str
+    problem: Problem | Recording | Images, arguments: dict[str, Any], name: str
 ) -> tuple[Problem, SolvePlan, dict[str, Any]]:
     """One problem with its bounds, how it is solved, and the arguments without the bounds.
 
@@ -365,92 +373,121 @@ def _one_problem(
     arguments = {name: value for name, value in arguments.items() if name != "max_elevation"}
     if any(is_traced(leaf) for leaf in jax.tree.leaves(problem)):
         return problem, plan, arguments
-    alone = independent(problem, estimate)[0]
-    # If JAX's 64 bits are off, a problem holds numpy arrays, which a traced index cannot index.
-    return jax.tree.map(jnp.asarray, alone), plan, arguments
+    return as_jax_holds(independent(problem, estimate)[0], problem), plan, arguments
 
 
-def _check_remaining(mask: Array, rest: Array) -> None:
-    """Refuse folds without which too few images remain; ``rest`` is 1 outside of each fold."""
+def _plain(*trees: Any) -> tuple[Any, ...]:
+    """These in numpy's arrays, and numpy; as they are, and jax.numpy, if one is traced."""
+    xp = array_module(*trees)
+    return (*(trees if xp is not np else (map_arrays(np.asarray, tree) for tree in trees)), xp)
+
+
+def _used(problem: Problem, result: Calibration) -> tuple[Problem, Any]:
+    """The images that a calibration used, of :func:`_plain` arrays, and what to compute with."""
+    problem, result, xp = _plain(problem, result)
+    mask = xp.asarray(result.mask, problem.mask.dtype)
+    return replace(problem.cleared(mask), mask=mask), xp
+
+
+def _placed(tree: T, given: Problem) -> T:
+    """JAX's arrays where the problem's are, unless it is traced."""
+    return tree if is_traced(tree) else as_jax_holds(tree, given)
+
+
+def _check_remaining(mask: AnyArray, rest: Bool[np.ndarray, "folds n"]) -> None:
+    """Refuse folds without which too few images remain; ``rest`` is False in each fold."""
     if is_traced(mask):
         return
-    least = int(np.min(np.sum(np.asarray(mask) * np.asarray(rest) > 0, axis=1)))
+    least = int(np.min(np.sum(np.asarray(mask) * rest > 0, axis=1)))
     if least < MINIMUM_IMAGES:
         raise InputError(
             f"holding out a fold leaves {least} images: at least {MINIMUM_IMAGES} are needed"
         )
 
 
-def _with_rows(problem: Problem, rows: Array, mask: Float[Array, " n"]) -> Problem:
+def _with_rows(problem: Problem, rows: AnyArray, mask: Float[AnyArray, "k n"]) -> Problem:
     """The problem with other rows of images in each of k copies."""
-
-    def drawn(rows: Int[Array, " n"]) -> Problem:
-        found = each_image(problem, lambda values, axis: jnp.take(values, rows, axis))
-        return replace(found, mask=mask)
-
-    return jax.vmap(drawn)(rows)
+    xp = array_module(problem, rows)
+    many = map_arrays(lambda leaf: xp.broadcast_to(leaf, (len(rows), *leaf.shape)), problem)
+    each = np.arange(len(rows))[:, None]
+    return replace(each_image(many, lambda values, axis: values[each, rows]), mask=mask)
 
 
-def _parameters(result: Calibration) -> Parameters:
-    """The unknowns of a calibration of one problem, as the model has them."""
-    matrix, values = jnp.asarray(result.image_to_probe), result.linearisation.further
-    found = Parameters.of(matrix[:3, :3], matrix[:3, 3], jnp.asarray(result.point))
-    if values is None:
-        return found
-    further = split_further(jnp.asarray(values), result.blocks)
-    return found.with_further({name: jnp.stack(parts) for name, parts in further.items()})
+def _unknowns(result: Calibration) -> tuple[Any, Any, Any, Values]:
+    """Rotation and translation of X, the target, and the free further unknowns by name."""
+    x, further = result.image_to_probe, result.linearisation.further
+    values = {} if further is None else split_further(further, result.blocks)
+    return x[..., :3, :3], x[..., :3, 3], result.point, values
 
 
-def _held_out_errors(held: Calibration, problem: Problem) -> tuple[Array, Array]:
-    """Errors and reconstructed target of image i through calibration i: (n, 3), (n, 3), mm."""
+def _points(problem: Problem, values: Values) -> tuple[AnyArray, AnyArray]:
+    """Lateral position and range of every image, mm."""
+    scaled = problem.measurements * problem.spacing
+    return measured(scaled[:, 0], scaled[:, 1], problem.face_offset, values)
 
-    def one(result: Calibration, image: Array) -> tuple[Array, Array]:
-        parameters = _parameters(result)
-        point = measured_points(parameters, problem)[image]
-        in_image = jnp.stack([point[0], jnp.zeros_like(point[0]), point[1]])
-        in_probe = parameters.rotation @ in_image + parameters.translation
-        pose = problem.poses[image]
-        there = pose[:3, :3] @ in_probe + pose[:3, 3]
-        return measurement_residual(parameters, problem)[image], there - parameters.point
 
-    errors, cloud = jax.vmap(one)(held, jnp.arange(problem.images))
-    return errors, problem.mask[:, None] * cloud
+def _held_out_errors(
+    held: Calibration, problem: Problem
+) -> tuple[Float[AnyArray, "n 3"], Float[AnyArray, "n 3"]]:
+    """Errors and reconstructed target of image i through calibration i, mm."""
+    xp = array_module(held, problem)
+    rotation, translation, target, values = _unknowns(held)
+    lateral, distance = _points(problem, values)
+    turned, origin = problem.poses[:, :3, :3], problem.poses[:, :3, 3]
+
+    def back(rotations: Any, vectors: Any) -> Any:
+        return xp.einsum("nji,nj->ni", rotations, vectors)
+
+    q = back(rotation, back(turned, target - origin) - translation)
+    far = xp.hypot(q[:, 1], q[:, 2])
+    errors = xp.stack([q[:, 0] - lateral, far - distance, q[:, 1]], axis=1)
+    in_image = xp.stack([lateral, xp.zeros_like(lateral), distance], axis=1)
+    in_probe = xp.einsum("nij,nj->ni", rotation, in_image) + translation
+    there = xp.einsum("nij,nj->ni", turned, in_probe) + origin
+    return problem.mask[:, None] * errors, problem.mask[:, None] * (there - target)
 
 
 def _log_density(
-    held: Calibration, problem: Problem, errors: Float[Array, "n 3"]
-) -> Float[Array, " n"]:
-    """Of the errors of image i under the noise model of calibration i."""
-    noise = jax.vmap(lambda fit, image: noise_covariance(fit, problem)[image])(
-        held, jnp.arange(problem.images)
-    )
+    held: Calibration, noise: Float[AnyArray, "n 3 3"], errors: Float[AnyArray, "n 3"]
+) -> Float[AnyArray, " n"]:
+    """Of the errors of image i under the noise model of calibration i, with that covariance."""
+    xp = array_module(held, noise, errors)
     lateral, distance, offset = errors.T
     if held.offset_law is not None:
         offset = offset - held.offset_law.mean
-    planes = jnp.stack([noise[:, 0, 0], noise[:, 1, 0], noise[:, 1, 1]])
-    first, mixed, second = (plane[0] for plane in factor_of(planes[:, None]))
-    third = jnp.sqrt(noise[:, 2, 2])
+    first = xp.sqrt(noise[:, 0, 0])
+    mixed = noise[:, 1, 0] / first
+    second = xp.sqrt(noise[:, 1, 1] - mixed * mixed)
+    third = xp.sqrt(noise[:, 2, 2])
     one = lateral / first
     squares = one**2 + ((distance - mixed * one) / second) ** 2 + (offset / third) ** 2
-    return -0.5 * squares - jnp.log(first * second * third) - 1.5 * jnp.log(2 * jnp.pi)
+    return -0.5 * squares - xp.log(first * second * third) - 1.5 * np.log(2 * np.pi)
 
 
 def _length_in_sds(
-    moved: Float[Array, "n 6"], covariance: Float[Array, "6 6"]
-) -> Float[Array, " n"]:
+    moved: Float[AnyArray, "n 6"], covariance: Float[AnyArray, "6 6"]
+) -> Float[AnyArray, " n"]:
     """sqrt(m' C^-1 m / 6) of every move m of X with the covariance C."""
-    scale = jnp.sqrt(jnp.diagonal(covariance))
+    xp = array_module(moved, covariance)
+    scale = xp.sqrt(xp.diagonal(covariance))
     # In SDs of the unknowns the matrix is a correlation matrix, well scaled for elimination.
-    unit = moved / scale
-    solved = dense.solve_positive(covariance / (scale[:, None] * scale), unit.T)
-    return jnp.sqrt(jnp.sum(unit.T * solved, axis=0) / 6)
+    unit, matrix = moved / scale, covariance / (scale[:, None] * scale)
+    if xp is np:
+        try:
+            half = np.linalg.solve(np.linalg.cholesky(matrix), unit.T)
+        except np.linalg.LinAlgError:
+            half = np.full_like(unit.T, np.nan)
+        return np.sqrt(np.sum(half**2, axis=0) / 6)
+    solved = dense.solve_positive(matrix, unit.T)
+    return xp.sqrt(xp.sum(unit.T * solved, axis=0) / 6)
 
 
-def _box_points(problem: Problem, result: Calibration) -> Float[Array, "5 2"]:
+def _box_points(problem: Problem, result: Calibration) -> Float[AnyArray, "5 2"]:
     """Corners and middle of the box that the used points fill, [lateral, axial], mm."""
-    points = measured_points(_parameters(result), problem)
+    xp = array_module(problem, result)
+    points = xp.stack(_points(problem, _unknowns(result)[3]), axis=1)
     seen = problem.mask[:, None] > 0
-    low = jnp.min(jnp.where(seen, points, jnp.inf), axis=0)
-    high = jnp.max(jnp.where(seen, points, -jnp.inf), axis=0)
-    share = jnp.asarray([[0, 0], [1, 0], [0, 1], [1, 1], [0.5, 0.5]], low.dtype)
+    low = xp.min(xp.where(seen, points, xp.inf), axis=0)
+    high = xp.max(xp.where(seen, points, -xp.inf), axis=0)
+    share = xp.asarray([[0, 0], [1, 0], [0, 1], [1, 1], [0.5, 0.5]], low.dtype)
     return (1 - share) * low + share * high

@@ -107,8 +107,9 @@ def warm(
         program_cache.private_folder()
     except (OSError, RuntimeError) as error:
         raise OutputError(f"the cache cannot be used: {error}") from error
-    from jaxcal.calibration.calibrate import calibrate, unknown_names
+    from jaxcal.calibration.calibrate import calibrate
     from jaxcal.data.problem import taken
+    from jaxcal.model.unknowns import unknown_names
     from jaxcal.runtime.executables import padded_images
 
     names = unknown_names(estimate)

@@ -201,13 +201,9 @@ def calibrate(
     inputs = [recording] if test is None else [recording, test]
     targets = [_export_target(export, inputs, out) for export in exports]
     import_engine()
-    from jaxcal.calibration.calibrate import (
-        Request,
-        check_alternation,
-        check_request,
-        unknown_names,
-    )
+    from jaxcal.calibration.calibrate import Request, check_alternation, check_request
     from jaxcal.calibration.calibrate import calibrate as solve
+    from jaxcal.model.unknowns import unknown_names
     from jaxcal.solvers.plan import Options
 
     alternation = {

@@ -240,10 +240,11 @@ def _from_recording(
     seed: int,
 ) -> tuple[Any, Candidates]:
     from jaxcal import design
-    from jaxcal.calibration.calibrate import calibrate, unknown_names
+    from jaxcal.calibration.calibrate import calibrate
     from jaxcal.data.probe import PRESETS
     from jaxcal.io.given_files import naming
     from jaxcal.io.hdf5 import load
+    from jaxcal.model.unknowns import unknown_names
     from jaxcal.report.next_poses import NOT_PLANNED
 
     names = unknown_names(estimate)

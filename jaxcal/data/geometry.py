@@ -18,12 +18,12 @@ _TERMS = 7
 
 
 def matrix_from_rotation(
-    rotation: Float[Array, "3 3"], translation: Float[Array, 3]
-) -> Float[Array, "4 4"]:
-    """The 4x4 transform with the given rotation and translation (mm)."""
-    top = jnp.concatenate([rotation, translation[:, None]], axis=1)
-    bottom = jnp.asarray([[0.0, 0.0, 0.0, 1.0]], dtype=top.dtype)
-    return jnp.concatenate([top, bottom], axis=0)
+    rotation: Float[Array, "*batch 3 3"], translation: Float[Array, "*batch 3"]
+) -> Float[Array, "*batch 4 4"]:
+    """The 4x4 transforms with the given rotations and translations (mm)."""
+    top = jnp.concatenate([rotation, translation[..., None]], axis=-1)
+    row = jnp.asarray([[0.0, 0.0, 0.0, 1.0]], dtype=top.dtype)
+    return jnp.concatenate([top, jnp.broadcast_to(row, (*top.shape[:-2], 1, 4))], axis=-2)
 
 
 def rotation_from_vector(vector: Float[Array, 3]) -> Float[Array, "3 3"]:

@@ -221,6 +221,7 @@ class Problem:
         covariance: np.ndarray | None = None,
         max_elevation: np.ndarray | float | None = None,
         spacing_mm: np.ndarray | tuple[float, float] | None = None,
+        face_offset_mm: float = 0.0,
         dtype: DTypeLike | None = None,
     ) -> Problem:
         """One checked problem from numpy arrays in memory; units as in :class:`Images`.
@@ -233,6 +234,7 @@ class Problem:
             covariance: (n, 2, 2).
             max_elevation: (n,) or one number, mm.
             spacing_mm: [lateral, axial] mm/px; without it a pixel problem estimates its scale.
+            face_offset_mm: range of pixel row 0, or of a measured range of 0, mm.
             dtype: float64 by default.
 
         Raises:
@@ -246,6 +248,7 @@ class Problem:
             covariance=covariance,
             max_elevation=max_elevation,
             spacing_mm=spacing_mm,
+            face_offset_mm=face_offset_mm,
         )
         return cls.from_recording(images, dtype=dtype)
 

@@ -11,7 +11,7 @@ length of a normal vector, whose quantiles :mod:`jaxcal.diagnostics.intervals` c
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf
 
 import numpy as np
@@ -19,6 +19,7 @@ import numpy as np
 from jaxcal import InputError
 from jaxcal.data.poses import rotation_angle
 from jaxcal.diagnostics.intervals import LEVEL, length_quantile
+from jaxcal.result.calibration import Calibration
 from jaxcal.result.transform import ImageTransform
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.given_values import check_made
@@ -56,7 +57,9 @@ class Comparison:
 
 
 def compare_calibrations(
-    first: ImageTransform, second: ImageTransform, points: Float[np.ndarray, "m 2"]
+    first: Calibration | ImageTransform,
+    second: Calibration | ImageTransform,
+    points: Float[np.ndarray, "m 2"] | Float[np.ndarray, 2],
 ) -> Comparison:
     """Map the same image points by two calibrations of one probe, and compare.
 
@@ -64,21 +67,19 @@ def compare_calibrations(
     nearer to each other than is expected here. The marker on the probe must be the same.
 
     Args:
-        first: a calibration, from :func:`jaxcal.load_calibration` or a result's
-            ``image_transform()``.
+        first: a calibration, computed or from :func:`jaxcal.load_calibration`.
         second: another one; both take pixels, or both points in mm.
-        points: [u, v] of image points, px, or [lateral, range] in mm.
+        points: [u, v] of image points, px, or [lateral, range] in mm; also a single one, (2,).
 
     Returns:
         How far apart the points are, and what the covariances expect: a :class:`Comparison`.
 
     Raises:
-        InputError: what is no calibration, one that must not be used, only one that takes pixels,
-            or points that :meth:`ImageTransform.apply` refuses.
+        InputError: what is no calibration, a batch, one that must not be used, only one that takes
+            pixels, or points that :meth:`ImageTransform.apply` refuses.
+        CalibrationError: under a JAX transformation.
     """
-    for name, each in (("first", first), ("second", second)):
-        check_made(name, each, ImageTransform, "load_calibration or image_transform()")
-        each.check_usable()
+    first, second = _transform("first", first), _transform("second", second)
     if (first.scale_mm_per_px is None) != (second.scale_mm_per_px is None):
         without, other = first, second
         if second.scale_mm_per_px is None:
@@ -88,7 +89,7 @@ def compare_calibrations(
             "cannot be given to both"
         )
     one, other = first.apply(points), second.apply(points)
-    points = np.asarray(points, float)
+    points = np.atleast_2d(np.asarray(points, float))
     apart = np.linalg.norm(one.points - other.points, axis=1)
     variances = np.trace(one.covariance + other.covariance, axis1=1, axis2=2)
     limit = np.nan
@@ -111,3 +112,13 @@ def compare_calibrations(
             np.degrees(rotation_angle(first.image_plane_to_probe, second.image_plane_to_probe))
         ),
     )
+
+
+def _transform(name: str, given: object) -> ImageTransform:
+    """The transform that a caller gave, or that of a result, if it can be used."""
+    if isinstance(given, Calibration):
+        given = replace(given.image_transform(), source=name)
+    check_made(name, given, ImageTransform, "jaxcal.calibrate or load_calibration")
+    assert isinstance(given, ImageTransform)
+    given.check_usable()
+    return given

@@ -50,6 +50,15 @@ class ElementPlanes(eqx.Module):
     elements: Float[Array, "3 batch elements"]
 
 
+def check_batch(problems: Problem) -> None:
+    """Raise InputError where these problems have not exactly one leading axis."""
+    if problems.mask.ndim != 2:
+        raise InputError(
+            "a batch with one leading axis is needed, e.g. jaxcal.stack([problem]); this one has "
+            f"the shape {problems.mask.shape[:-1]}"
+        )
+
+
 class ImagePlanes(eqx.Module):
     """What was measured, one plane (batch, images) for every number.
 
@@ -82,11 +91,7 @@ class ImagePlanes(eqx.Module):
         Raises:
             InputError: one problem, or a batch with more axes.
         """
-        if problems.mask.ndim != 2:
-            raise InputError(
-                "a batch with one leading axis is needed, e.g. jaxcal.stack([problem]); this one "
-                f"has the shape {problems.mask.shape[:-1]}"
-            )
+        check_batch(problems)
         used = problems.mask > 0
 
         def plane(values: Array, instead: float) -> Array:

@@ -28,20 +28,22 @@ The last two have one more unknown in each image, which is eliminated there.
 from __future__ import annotations
 
 import abc
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from jaxcal import InputError
-from jaxcal.model.batch import ImagePlanes, Iterate, pad_images, targets
+from jaxcal.data.problem import Problem
+from jaxcal.model.batch import ImagePlanes, Iterate, check_batch, pad_images, targets
 from jaxcal.model.thresholds import LARGEST_ELEVATION
 from jaxcal.model.unknowns import (
+    DELAY_SD_S,
     FURTHER,
     RIGID_UNKNOWNS,
+    SOUND_SPEED_SD_M_S,
     TABLE,
     Blocks,
     block_slice,
@@ -52,7 +54,9 @@ from jaxcal.model.unknowns import (
     with_prior,
 )
 from jaxcal.model.unrolled import Matrix, Vector, add
+from jaxcal.runtime.array_types import AnyArray
 from jaxcal.runtime.arrays import is_traced
+from jaxcal.runtime.given_values import real_array
 
 TRACKER_STEPS = 4
 """Newton steps for a tracker's elevational error; the range curves so little that two would do."""
@@ -201,13 +205,13 @@ class Observation(eqx.Module):
         return 0.0
 
 
-def _check_values(name: str, values: Array, *, zero: bool = False) -> None:
+def _check_values(name: str, values: Any, *, zero: bool = False, unit: str = "mm") -> None:
     """Refuse NaN and what is below zero (or is zero), where the values are known already."""
     if is_traced(values):
         return
-    known = np.asarray(values)
+    known = real_array(values, name)
     if not (known >= 0 if zero else known > 0).all():
-        raise InputError(f"{name} must be {'zero or ' if zero else ''}positive, mm")
+        raise InputError(f"{name} must be {'zero or ' if zero else ''}positive, {unit}")
 
 
 class Points(Observation):
@@ -594,23 +598,62 @@ class TrackedPoints(LocalUnknown):
 
 
 class MediumPrior(eqx.Module):
-    """The prior of those further unknowns that have one: Gaussian, about their nominal values.
+    """Gaussian prior of sound speed and delay, about their nominal values; :meth:`of` makes one.
 
     Attributes:
-        sd: prior SDs of the steps of :func:`jaxcal.model.unknowns.with_prior`.
+        sd: SDs of the steps of those that are free: of the logarithm of the sound speed, and of the
+            delay in mm at the nominal speed.
         blocks: the free unknowns (static).
     """
 
     sd: Float[Array, "k batch"]
     blocks: Blocks = eqx.field(static=True)
 
+    @classmethod
+    def of(
+        cls,
+        problems: Problem,
+        blocks: Blocks,
+        *,
+        sound_speed_sd: Float[AnyArray, ""] | float = SOUND_SPEED_SD_M_S,
+        delay_sd: Float[AnyArray, ""] | float = DELAY_SD_S,
+    ) -> MediumPrior | None:
+        """The prior of those of sound speed and delay that are free; None where neither is.
+
+        Args:
+            problems: a batch (one leading axis), for its nominal sound speeds.
+            blocks: the free unknowns.
+            sound_speed_sd: SD of the sound speed, m/s.
+            delay_sd: SD of the delay, s.
+
+        Raises:
+            InputError: an SD that is not positive; one problem, or a batch with more axes.
+        """
+        check_batch(problems)
+        given = {"sound-speed": (sound_speed_sd, "m/s"), "delay": (delay_sd, "s")}
+        speed, steps = problems.nominal_sound_speed, []
+        for name in with_prior(blocks):
+            sd, unit = given[name]
+            _check_values(f"{TABLE[name].field}_sd", sd, unit=unit)
+            steps.append(jnp.broadcast_to(sd * TABLE[name].per_unit(speed), speed.shape))
+        return cls(jnp.stack(steps), blocks) if steps else None
+
     def deviations(self, iterate: Iterate) -> list[tuple[int, Array, Array]]:
-        """Index, deviation from nominal and precision of every component that has a prior."""
+        """Index, deviation from nominal and precision of every component that has a prior.
+
+        Raises:
+            InputError: the prior is of other unknowns than the iterate's.
+        """
+        names = with_prior(iterate.blocks)
+        if names != with_prior(self.blocks):
+            raise InputError(
+                f"this MediumPrior is for the unknowns {self.blocks}, not for {iterate.blocks}"
+            )
         found = []
-        for name, sd in zip(with_prior(self.blocks), self.sd, strict=True):
+        for name, sd in zip(names, self.sd, strict=True):
             values = iterate.further(name)
             assert values is not None
-            for index, value in enumerate(values, block_slice(self.blocks, name).start):
+            for index, value in enumerate(values, block_slice(iterate.blocks, name).start):
                 away = step_between(name, TABLE[name].nominal, value, jnp.log)
                 found.append((index, away, 1 / (sd * sd)))
         return found

@@ -67,8 +67,8 @@ class Parameters(eqx.Module):
         }
         return replace(self, **fields)
 
-    def matrix(self) -> Float[Array, "4 4"]:
-        """X as a 4x4 matrix, mm."""
+    def matrix(self) -> Float[Array, "*batch 4 4"]:
+        """X as 4x4 matrices, mm."""
         return matrix_from_rotation(self.rotation, self.translation)
 
 

@@ -10,13 +10,14 @@ words) reads this table. A new unknown needs a row, a line in :func:`measured`, 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 
 from jaxcal import InputError
+from jaxcal.runtime.messages import shown
 
 Blocks = tuple[str, ...]
 """Names of free unknowns, in the table's order; X and the target come first."""
@@ -239,6 +240,17 @@ def further_derivatives(
             at = function({**values, name: moved})
             found.append((first + k, [np.imag(array) / TINY for array in at]))
     return found
+
+
+def unknown_names(estimate: Any) -> tuple[str, ...]:
+    """Names of further unknowns as a tuple; a text may hold one name or several with commas."""
+    if isinstance(estimate, str):
+        return tuple(name.strip() for name in estimate.split(","))
+    if estimate is None:
+        return ()
+    if not isinstance(estimate, Iterable):
+        raise InputError(f"estimate must be names of unknowns, not {shown(estimate)}")
+    return tuple(estimate)
 
 
 def count_unknowns(blocks: Blocks) -> int:

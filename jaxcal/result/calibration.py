@@ -562,7 +562,7 @@ class Calibration:
     def _concrete(value: AnyArray) -> np.ndarray:
         if is_traced(value):
             raise CalibrationError(
-                "text is not available under jit, vmap or grad; use the arrays (status_code, "
-                "converged, ...) there, and the text outside"
+                "texts, and what is computed by numpy, are not available under jit, vmap or grad: "
+                "use the arrays (status_code, converged, ...) there, and the rest outside"
             )
         return np.asarray(value)

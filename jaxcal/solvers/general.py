@@ -85,28 +85,34 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
 
     Attributes:
         tolerance: gradient cosine to stop at: the largest between the residuals and a column of
-            their Jacobian.
+            their Jacobian; by default 1e-10 in float64, 1e-4 in float32.
         damping: first lambda, relative to the diagonal.
         rtol: without effect; optimistix asks every solver for it.
-        atol: without effect, as ``rtol``.
-        norm: without effect, as ``rtol``.
+        atol: ``optimistix.root_find`` takes an answer for a root if the norm of its residuals is
+            below this; without effect in ``optimistix.least_squares``.
+        norm: see ``atol``; by default the largest magnitude.
 
     Raises:
-        InputError: a tolerance or damping below zero, or one that is no number.
+        InputError: a tolerance, damping or ``atol`` below zero, or one that is no number.
     """
 
-    tolerance: float = 1e-10
+    tolerance: float | None = None
     damping: float = 1e-3
-    # optimistix asks every solver for these; this one stops by its own rule.
     rtol: float = 0.0
-    atol: float = 0.0
+    atol: float = 1e-6
     norm: Callable[[PyTree], Array] = optx.max_norm
 
     def __check_init__(self) -> None:
-        for name, value in (("tolerance", self.tolerance), ("damping", self.damping)):
+        given = {"damping": self.damping, "atol": self.atol}
+        if self.tolerance is not None:
+            given["tolerance"] = self.tolerance
+        for name, value in given.items():
             known = isinstance(value, int | float) and value >= 0
             if not (known or isinstance(value, jax.Array)):
                 raise InputError(f"{name} must be a number of at least 0, not {value!r}")
+
+    def _least_cosine(self, dtype: jnp.dtype) -> float:
+        return default_tolerance(dtype) if self.tolerance is None else self.tolerance
 
     def init(
         self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any
@@ -123,15 +129,21 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         descent, rounding, aux = state
         _, unravel = ravel_pytree(y)
 
-        def equations(iterate: Flat, exact: Array) -> NormalEquations:
-            def residual(shared: Array) -> Array:
-                return ravel_pytree(fn(unravel(shared), args)[0])[0]
+        def residual(shared: Array) -> tuple[Array, Any]:
+            value, beside = fn(unravel(shared), args)
+            return ravel_pytree(value)[0], beside
 
-            return _normal(residual, iterate.shared[:, 0])
-
-        after = iterate_once(descent, equations, rounding, self.tolerance, 2**30, exact_below=0.0)
-        found = unravel(after.iterate.shared[:, 0])
-        return found, (after, rounding, aux), aux
+        here = descent.candidate.shared
+        normal, beside = _normal(residual, here[:, 0])
+        tolerance = self._least_cosine(here.dtype)
+        after = iterate_once(
+            descent, lambda iterate, exact: normal, rounding, tolerance, 2**30, exact_below=0.0
+        )
+        found = after.iterate.shared
+        # That of the answer, as optimistix wants it: by it root_find judges whether this is a root.
+        taken = jnp.array_equal(found, here)
+        aux = jax.tree.map(lambda new, old: jnp.where(taken, new, old), beside, aux)
+        return unravel(found[:, 0]), (after, rounding, aux), aux
 
     def terminate(
         self, fn: Any, y: Any, args: Any, options: Any, state: Any, tags: Any
@@ -155,14 +167,16 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         tags: Any,
         result: optx.RESULTS,
     ) -> tuple[Any, Any, dict[str, Any]]:
-        return y, fn(y, args)[1], {}
+        return y, aux, {}
 
 
-def _normal(residual: Callable[[Array], Array], here: Float[Array, " p"]) -> NormalEquations:
-    """Gauss-Newton's normal equations of dense residuals, as those of a batch of one."""
-    value, push = jax.linearize(residual, here)
+def _normal(
+    residual: Callable[[Array], tuple[Array, Any]], here: Float[Array, " p"]
+) -> tuple[NormalEquations, Any]:
+    """Gauss-Newton's normal equations of dense residuals, as those of a batch of one; and aux."""
+    value, push, aux = jax.linearize(residual, here, has_aux=True)
     jacobian = jax.vmap(push)(jnp.eye(here.shape[0], dtype=here.dtype))
-    return _packed(jacobian @ jacobian.T, jacobian @ value, jnp.sum(value**2), None)
+    return _packed(jacobian @ jacobian.T, jacobian @ value, jnp.sum(value**2), None), aux
 
 
 def _packed(matrix: Array, gradient: Array, cost: Array, squares: Array | None) -> NormalEquations:
@@ -220,7 +234,7 @@ def arrow_least_squares(
     bound = _bound(limit, rows).astype(flat.dtype)
 
     solver = _ArrowSolver(
-        tolerance=default_tolerance(flat.dtype) if tolerance is None else tolerance,
+        tolerance=tolerance,
         damping=damping,
         limit=bound,
     )
@@ -268,8 +282,9 @@ class _ArrowSolver(LevenbergMarquardt):
         candidate, normal = self._at(fn, at, args, descent.damping)
         # The candidate's own derivatives say how its local unknowns follow the next step.
         descent = eqx.tree_at(lambda state: state.candidate, descent, candidate)
+        tolerance = self._least_cosine(here.shared.dtype)
         after = iterate_once(
-            descent, lambda iterate, exact: normal, rounding, self.tolerance, 2**30, exact_below=0.0
+            descent, lambda iterate, exact: normal, rounding, tolerance, 2**30, exact_below=0.0
         )
         iterate = after.iterate
         # A step knows of the shared unknowns' gradient alone. Where that is zero, the local ones
@@ -280,9 +295,8 @@ class _ArrowSolver(LevenbergMarquardt):
             lambda state: (state.active, state.converged),
             after,
             (
-                after.active | (still > self.tolerance) & jnp.logical_not(stopped),
-                after.converged
-                & ((still <= 10 * self.tolerance) | (after.stalled >= MOST_STALLED)),
+                after.active | (still > tolerance) & jnp.logical_not(stopped),
+                after.converged & ((still <= 10 * tolerance) | (after.stalled >= MOST_STALLED)),
             ),
         )
         return (iterate.shared[:, 0], iterate.local[:, 0]), (after, rounding, aux), aux

@@ -35,6 +35,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxcal import InputError
 from jaxcal.model.batch import ImagePlanes, Iterate, barrier, choose
 from jaxcal.model.observations import LocalUnknown, MediumPrior, Observation
 from jaxcal.solvers import dense
@@ -371,7 +372,17 @@ def minimise(
 
     Returns:
         Where it stopped, for every problem.
+
+    Raises:
+        InputError: a start or SDs of another number of problems than the data.
     """
+    batch = images.batch_size
+    for name, array in (("start", start.point), ("sigma", observation.sigma)):
+        if array.ndim != 2 or array.shape[1] != batch:
+            raise InputError(
+                f"{name} must be of {batch} problems (the last axis), as the images are; its shape "
+                f"is {array.shape}"
+            )
     if tolerance is None:
         tolerance = default_tolerance(images.mask.dtype)
     images, observation = barrier((images.padded(), observation.padded()))

@@ -117,12 +117,10 @@ def observe(
     sigma = jnp.broadcast_to(sigma[:, None], (len(fallback), images.batch_size))
     medium = None
     if given.prior_sd is not None:
-        speed = problems.nominal_sound_speed
-        steps = [
-            jnp.broadcast_to(sd * TABLE[name].per_unit(speed), speed.shape)
-            for name, sd in zip(with_prior(plan.blocks), given.prior_sd, strict=True)
-        ]
-        medium = MediumPrior(jnp.stack(steps), plan.blocks)
+        names = [f"{TABLE[name].field}_sd" for name in with_prior(plan.blocks)]
+        medium = MediumPrior.of(
+            problems, plan.blocks, **dict(zip(names, given.prior_sd, strict=True))
+        )
     if plan.channels:
         return ChannelDistances(sigma), medium
     shape = None

@@ -35,7 +35,7 @@ from jaxcal.data.problem import Problem
 from jaxcal.data.recording import MINIMUM_IMAGES
 from jaxcal.model import unrolled
 from jaxcal.model.unrolled import Matrix, Vector
-from jaxcal.runtime.arrays import is_traced
+from jaxcal.runtime.arrays import is_traced, map_arrays
 from jaxcal.runtime.jax_modes import in_standard_promotion, own_modes, require_float64, with_dtype
 from jaxcal.solvers.closed_form.reduced_objective import (
     CONSTRAINTS,
@@ -51,6 +51,9 @@ from jaxcal.solvers.closed_form.single import ClosedForm, solve_problem
 CHUNK = 256
 """Problems in one call of the compiled program."""
 
+FEW = 1024
+"""So many problems are solved one by one, in about a second; to compile takes six."""
+
 NEWTON_STEPS = 30
 MET = 500
 """Constraints are met when they are off by less than this many roundings of |x|^2."""
@@ -58,12 +61,17 @@ SHORTER = 0.25
 """Factor on a step that was no better."""
 
 
-def solve_batch(problems: Problem, estimate: tuple[str, ...]) -> ClosedForm:
+def solve_batch(problems: Problem, estimate: tuple[str, ...], *, few: int = FEW) -> ClosedForm:
     """Conventional calibrations of problems with any leading axes, concrete or traced.
 
+    Args:
+        problems: the batch.
+        estimate: as for :func:`jaxcal.calibrate_closed_form`.
+        few: so many concrete problems are solved without a compiled program.
+
     Returns:
-        Arrays with the problems' leading axes. Concrete problems give numpy arrays in float64, and
-        those that this module does not certify are solved again, one by one, by
+        Arrays with the problems' leading axes. Concrete problems give numpy arrays in float64. Few
+        of them, and those that this module does not certify, are solved one by one, by
         :func:`jaxcal.solvers.closed_form.single.solve`. A problem with NaN or fewer than 4 images
         gives NaN.
 
@@ -76,14 +84,15 @@ def solve_batch(problems: Problem, estimate: tuple[str, ...]) -> ClosedForm:
         problems, covariance=None, max_elevation=None, channels=None, sound_speed=None, delay=None
     )
     shape = problems.batch_shape
-    flat = jax.tree.map(lambda leaf: leaf.reshape((-1, *leaf.shape[len(shape) :])), problems)
-    if any(is_traced(leaf) for leaf in jax.tree.leaves(problems)):
+    flat = map_arrays(lambda leaf: leaf.reshape((-1, *leaf.shape[len(shape) :])), problems)
+    if is_traced(problems):
         with own_modes(bits_too=False):
             require_float64("jaxcal.calibrate_closed_form")
             answer = solve_traceable(with_dtype(flat, np.float64), estimate)
     else:
-        answer = _concrete(jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), flat), estimate)
-    return jax.tree.map(lambda leaf: leaf.reshape((*shape, *leaf.shape[1:])), answer)
+        flat = map_arrays(lambda leaf: np.asarray(leaf, np.float64), flat)
+        answer = _concrete(flat, estimate, few)
+    return map_arrays(lambda leaf: leaf.reshape((*shape, *leaf.shape[1:])), answer)
 
 
 _compiled = jax.jit(
@@ -91,34 +100,52 @@ _compiled = jax.jit(
 )
 
 
-def _concrete(problems: Problem, estimate: tuple[str, ...]) -> ClosedForm:
+def _concrete(problems: Problem, estimate: tuple[str, ...], few: int) -> ClosedForm:
     count = len(problems.mask)
-    size = min(CHUNK, count)
-    parts = []
-    with own_modes():
-        for start in range(0, count, size):
-            rows = slice(start, start + size)
-            part = jax.tree.map(lambda leaf, rows=rows: leaf[rows], problems)
-            short = size - len(part.mask)
-            if short:
-                part = jax.tree.map(
-                    lambda leaf, short=short: np.concatenate([leaf, np.repeat(leaf[:1], short, 0)]),
-                    part,
-                )
-            parts.append(_compiled(part, estimate))
-    answer = jax.tree.map(
-        lambda *leaves: np.concatenate([np.asarray(leaf) for leaf in leaves])[:count], *parts
-    )
+    answer = _unsolved(problems) if count <= few else _by_chunks(problems, estimate)
     for k in np.flatnonzero(~answer.certified):
-        one = jax.tree.map(lambda leaf, k=k: leaf[k], problems)
         try:
-            alone = solve_problem(one, estimate)
+            alone = solve_problem(map_arrays(lambda leaf, k=k: leaf[k], problems), estimate)
         except InputError:
             continue
         for field in fields(ClosedForm):
             if getattr(answer, field.name) is not None:
                 getattr(answer, field.name)[k] = getattr(alone, field.name)
     return answer
+
+
+def _unsolved(problems: Problem) -> ClosedForm:
+    """NaN and no proof for every problem (one leading axis)."""
+    count = len(problems.mask)
+
+    def nothing(*shape: int) -> np.ndarray:
+        return np.full((count, *shape), np.nan)
+
+    return ClosedForm(
+        image_to_probe=nothing(4, 4),
+        point_mm=nothing(3),
+        scale_mm_per_px=nothing(2) if problems.pixels else None,
+        sound_speed_factor=nothing(),
+        rms_mm=nothing(),
+        objective_mm2=nothing(),
+        certified=np.zeros(count, bool),
+        gap_mm2=nothing() + np.inf,
+        unique=np.zeros(count, bool),
+    )
+
+
+def _by_chunks(problems: Problem, estimate: tuple[str, ...]) -> ClosedForm:
+    """By the compiled program; the last chunk is filled up, or it would be another program."""
+    count = len(problems.mask)
+    filled = np.arange(-(-count // CHUNK) * CHUNK) % count
+    parts = []
+    with own_modes():
+        for rows in filled.reshape(-1, CHUNK):
+            part = map_arrays(lambda leaf, rows=rows: leaf[rows], problems)
+            parts.append(_compiled(part, estimate))
+    return jax.tree.map(
+        lambda *leaves: np.concatenate([np.asarray(leaf) for leaf in leaves])[:count], *parts
+    )
 
 
 def solve_traceable(problems: Problem, estimate: tuple[str, ...]) -> ClosedForm:

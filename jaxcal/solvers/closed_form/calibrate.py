@@ -6,26 +6,27 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jaxcal.data.problem import Problem, as_batch, check_shapes
+from jaxcal.model.unknowns import unknown_names
 from jaxcal.runtime.arrays import is_traced
 from jaxcal.solvers.closed_form.single import ClosedForm, solve_problem
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from jaxcal.data.problem import Problem
     from jaxcal.data.recording import Images, Recording
 
 
 def calibrate_closed_form(
     problem: Problem | Recording | Images | Sequence[Problem | Recording | Images],
     *,
-    estimate: str | tuple[str, ...] = (),
+    estimate: str | Sequence[str] = (),
 ) -> ClosedForm:
     """Conventional calibration (Eq. 7) in closed form, with a certificate.
 
-    One problem is solved by numpy alone (:mod:`jaxcal.solvers.closed_form.single`). A batch, and a
-    problem that ``jax.jit``, ``jax.vmap`` or ``jax.grad`` looks at, is solved by
-    :mod:`jaxcal.solvers.closed_form.batch`.
+    One problem is solved by numpy alone (:mod:`jaxcal.solvers.closed_form.single`), and so is each
+    of up to 1024 problems of a batch. A larger batch, and a problem that ``jax.jit``, ``jax.vmap``
+    or ``jax.grad`` looks at, is solved by :mod:`jaxcal.solvers.closed_form.batch`.
 
     Args:
         problem: a problem or a batch of them, a recording, or one set of images; a list of them is
@@ -41,14 +42,13 @@ def calibrate_closed_form(
     Raises:
         InputError: other names in ``estimate``, data that cannot be used, fewer than 4 images.
     """
-    if isinstance(estimate, str):
-        estimate = (estimate,)
+    names = unknown_names(estimate)
     if isinstance(problem, list | tuple):
-        from jaxcal.data.problem import as_batch
-
         problem = as_batch(problem, "jaxcal.calibrate_closed_form")
+    if isinstance(problem, Problem):
+        check_shapes(problem)
     if np.ndim(getattr(problem, "mask", ())) > 1 or is_traced(problem):
         from jaxcal.solvers.closed_form.batch import solve_batch
 
-        return solve_batch(problem, tuple(estimate))  # pyright: ignore[reportArgumentType]
-    return solve_problem(problem, estimate)  # pyright: ignore[reportArgumentType]
+        return solve_batch(problem, names)  # pyright: ignore[reportArgumentType]
+    return solve_problem(problem, names)  # pyright: ignore[reportArgumentType]

@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.runtime.array_types import Float
+from jaxcal.model.unknowns import unknown_names
+from jaxcal.runtime.array_types import AnyArray, Float
+from jaxcal.runtime.arrays import is_traced
 from jaxcal.runtime.given_values import real_array
 from jaxcal.solvers.closed_form.reduced_objective import (
     Certificate,
@@ -23,6 +25,8 @@ from jaxcal.solvers.closed_form.reduced_objective import (
 from jaxcal.solvers.closed_form.rotation_relaxation import lower_bound
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from jaxcal.data.problem import Problem
     from jaxcal.data.recording import Images, Recording
 
@@ -32,12 +36,12 @@ ORTHONORMAL = 1e-6
 
 def certify(
     problem: Problem | Recording | Images,
-    image_to_probe: Float[np.ndarray, "4 4"],
-    point: Float[np.ndarray, 3] | None = None,
+    image_to_probe: Float[AnyArray, "4 4"],
+    point: Float[AnyArray, 3] | None = None,
     *,
-    scale_mm_per_px: Float[np.ndarray, 2] | None = None,
+    scale_mm_per_px: Float[AnyArray, 2] | None = None,
     sound_speed_factor: float = 1.0,
-    estimate: tuple[str, ...] = (),
+    estimate: str | Sequence[str] = (),
 ) -> Certificate:
     """Prove that a solution is the global minimum of Eq. 7, or bound how far it is above it.
 
@@ -48,16 +52,19 @@ def certify(
         scale_mm_per_px: [lateral, axial], the estimated scales, if ``estimate`` names one.
         sound_speed_factor: the estimated sound speed over the nominal one.
         estimate: what was unknown beside X and the target: ``()``, ``("scale",)``,
-            ``("common-scale",)`` or ``("sound-speed",)``.
+            ``("common-scale",)`` or ``("sound-speed",)``; one name may stand without its tuple.
 
     Returns:
         A :class:`Certificate`. It is about the objective of Eq. 7, which the conventional method
         minimises; joint methods minimise another one.
 
     Raises:
-        InputError: data that cannot be used, no rotation, or a wanted scale that is missing.
+        InputError: data that cannot be used, no rotation, a wanted scale that is missing, or traced
+            arrays.
     """
-    data, constraints = image_data(problem, estimate)
+    if is_traced(problem, image_to_probe, point, scale_mm_per_px, sound_speed_factor):
+        raise InputError("certify is computed by numpy: call it outside of jit, vmap and grad")
+    data, constraints = image_data(problem, unknown_names(estimate))
     reduced = reduce(data, constraints)
     transform = real_array(image_to_probe, "image_to_probe")
     if transform.shape != (4, 4) or not np.isfinite(transform).all():
