@@ -193,6 +193,25 @@ def test_log_density_has_the_trackers_errors_in_it(data, whole):
         np.testing.assert_allclose(found.log_density[fold == k], expected, rtol=1e-9)
 
 
+def test_held_out_images_take_memory_by_their_number(data, whole):
+    """With two folds no array is as large as the square of the number of images."""
+    images = 16 * COUNT
+
+    def longer(leaf):
+        axes = [axis for axis, size in enumerate(leaf.shape) if size == COUNT]
+        return jnp.repeat(leaf, 16, axes[0]) if axes else leaf
+
+    data, whole = (jax.tree.map(longer, each) for each in (data, whole))
+    fits = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), whole)
+    traced = jax.make_jaxpr(_compared)(data, whole, fits, jnp.arange(images) % 2)
+    programs, found = [traced.jaxpr], []
+    while programs:
+        for equation in programs.pop().eqns:
+            found += [np.prod(out.aval.shape) for out in equation.outvars]
+            programs += [each.jaxpr for each in equation.params.values() if hasattr(each, "jaxpr")]
+    assert images * 16 <= max(found) < images**2
+
+
 def test_log_density_is_that_of_the_noise_model(data, whole):
     """With the images' own covariances and the mean of the offsets, where these were found."""
     sigma, tau, fold = np.array([0.3, 0.2, 1.0]), 0.5, np.arange(COUNT) % 2

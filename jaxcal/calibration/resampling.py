@@ -162,7 +162,15 @@ def _compared(
 
     As one program: compiled operation by operation it takes several times as long.
     """
-    held = jax.tree.map(lambda leaf: leaf[fold], fits)
+    # Arrays of all images for each image would need memory by the square of their number.
+    few = replace(
+        fits,
+        mask=fits.mask[:, :1],
+        elevation=fits.elevation[:, :1],
+        problem=None,
+        linearisation=replace(fits.linearisation, average_elevation_sd=None),
+    )
+    held = jax.tree.map(lambda leaf: leaf[fold], few)
     errors, cloud = _held_out_errors(held, problem)
     mask = problem.mask
     used = jnp.sum(mask)
@@ -179,7 +187,7 @@ def _compared(
         cloud=cloud,
         precision=jnp.sqrt(jnp.sum(mask[:, None] * (cloud - mean) ** 2) / (used - 1)),
         rms=jnp.sqrt(jnp.sum(cloud**2) / used),
-        log_density=mask * _log_density(held, problem, errors),
+        log_density=mask * _log_density(fits, problem, fold, errors),
         moved=moved,
         influence=_length_in_sds(moved, jnp.asarray(result.covariance)),
         image_to_probe=jnp.asarray(fits.image_to_probe),
@@ -399,28 +407,32 @@ def _held_out_errors(held: Calibration, problem: Problem) -> tuple[Array, Array]
     """Errors and reconstructed target of image i through calibration i: (n, 3), (n, 3), mm."""
 
     def one(result: Calibration, image: Array) -> tuple[Array, Array]:
-        parameters = _parameters(result)
-        point = measured_points(parameters, problem)[image]
+        parameters, alone = _parameters(result), _alone(problem, image)
+        point = measured_points(parameters, alone)[0]
         in_image = jnp.stack([point[0], jnp.zeros_like(point[0]), point[1]])
         in_probe = parameters.rotation @ in_image + parameters.translation
         pose = problem.poses[image]
         there = pose[:3, :3] @ in_probe + pose[:3, 3]
-        return measurement_residual(parameters, problem)[image], there - parameters.point
+        return measurement_residual(parameters, alone)[0], there - parameters.point
 
     errors, cloud = jax.vmap(one)(held, jnp.arange(problem.images))
     return errors, problem.mask[:, None] * cloud
 
 
+def _alone(problem: Problem, image: Int[Array, ""]) -> Problem:
+    """The problem of one image."""
+    return each_image(problem, lambda values, axis: jnp.take(values, image[None], axis))
+
+
 def _log_density(
-    held: Calibration, problem: Problem, errors: Float[Array, "n 3"]
+    fits: Calibration, problem: Problem, fold: Int[Array, " n"], errors: Float[Array, "n 3"]
 ) -> Float[Array, " n"]:
-    """Of the errors of image i under the noise model of calibration i."""
-    noise = jax.vmap(lambda fit, image: noise_covariance(fit, problem)[image])(
-        held, jnp.arange(problem.images)
-    )
+    """Of the errors of every image under the noise model of its fold's calibration."""
+    noise = jax.vmap(lambda fit: noise_covariance(fit, problem))(fits)
+    noise = noise[fold, jnp.arange(problem.images)]
     lateral, distance, offset = errors.T
-    if held.offset_law is not None:
-        offset = offset - held.offset_law.mean
+    if fits.offset_law is not None:
+        offset = offset - fits.offset_law.mean[fold]
     planes = jnp.stack([noise[:, 0, 0], noise[:, 1, 0], noise[:, 1, 1]])
     first, mixed, second = (plane[0] for plane in factor_of(planes[:, None]))
     third = jnp.sqrt(noise[:, 2, 2])
