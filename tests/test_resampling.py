@@ -15,6 +15,7 @@ from oracle.model import Data, Unknowns, errors
 from scipy.stats import multivariate_normal, norm
 
 import jaxcal
+from jaxcal.calibration import resampling
 from jaxcal.calibration.resampling import (
     _compared,
     _from_full_image,
@@ -191,6 +192,23 @@ def test_log_density_has_the_trackers_errors_in_it(data, whole):
         there = Unknowns(x[k, :3, :3], x[k, :3, 3], np.asarray(fits.point)[k], np.ones(2))
         expected = norm.logpdf(errors(held, there), scale=np.hypot(sigma, tau)).sum(axis=1)
         np.testing.assert_allclose(found.log_density[fold == k], expected, rtol=1e-9)
+
+
+def test_many_calibrations_are_solved_in_batches(data, whole, monkeypatch):
+    """Draws are the same in batches of any size, and no batch has more images than is set."""
+    asked, solve = [], resampling.calibrate_batch
+
+    def noted(problems, **arguments):
+        asked.append(problems.mask.shape)
+        return solve(problems, **arguments)
+
+    monkeypatch.setattr(resampling, "calibrate_batch", noted)
+    once = bootstrap(data, COUNT, result=whole, **CONVENTIONAL)
+    monkeypatch.setattr(resampling, "MOST_TOGETHER", COUNT * COUNT)
+    twice = bootstrap(data, 2 * COUNT, result=whole, **CONVENTIONAL)
+    assert asked == 3 * [(COUNT, COUNT)]
+    np.testing.assert_array_equal(twice.image_to_probe[:COUNT], once.image_to_probe)
+    assert len(np.unique(twice.image_to_probe, axis=0)) == 2 * COUNT
 
 
 def test_held_out_images_take_memory_by_their_number(data, whole):

@@ -11,8 +11,8 @@ arrays (and a key), which work under jit.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import fields, replace
-from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -50,6 +50,8 @@ from jaxcal.solvers.plan import SolvePlan
 
 LARGEST_RESAMPLES = 100_000
 """Most resamples of a bootstrap."""
+MOST_TOGETHER = 200_000
+"""Most images, over all calibrations, that are solved in one batch: about 1 GiB."""
 
 
 class CrossValidation(eqx.Module):
@@ -147,10 +149,12 @@ def cross_validate(
     fold = np.arange(count) % folds
     rest = jnp.asarray(fold[None, :] != np.arange(folds)[:, None], problem.mask.dtype)
     _check_remaining(problem.mask, rest)
-    many = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (folds, *leaf.shape)), problem)
-    # Outliers were found with all images.
-    arguments["robust"] = False
-    fits = calibrate_batch(replace(many, mask=problem.mask * rest), **arguments)
+
+    def without(some: Int[Array, " k"]) -> Problem:
+        many = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(some), *leaf.shape)), problem)
+        return replace(many, mask=problem.mask * rest[some])
+
+    fits = _in_batches(without, folds, count, arguments)
     return _compared(problem, result, fits, fold)
 
 
@@ -232,16 +236,41 @@ def bootstrap(
     result = _full_calibration(problem, result, plan, arguments)
     mask = jnp.asarray(result.mask, problem.mask.dtype)
     problem = replace(problem, mask=mask)
-    rows = _rows(root, mask, resamples)
+
     # Each draw has as many images as were used, since the mask leaves out the other rows.
-    arguments["robust"] = False
-    fits = calibrate_batch(_with_rows(problem, rows, mask), **arguments)
+    def drawn(some: Int[Array, " k"]) -> Problem:
+        return _with_rows(problem, _rows(root, mask, some), mask)
+
+    fits = _in_batches(drawn, resamples, problem.images, arguments)
     return _scatter(problem, result, fits)
 
 
-@partial(jax.jit, static_argnums=2)
-def _rows(root: Key[Array, ""], mask: Float[Array, " n"], resamples: int) -> Int[Array, "k n"]:
-    """Used images drawn with replacement, for each resample."""
+def _in_batches(
+    make: Callable[[Array], Problem], count: int, images: int, arguments: dict[str, Any]
+) -> Calibration:
+    """Calibrations of many versions of a problem, without their data.
+
+    Args:
+        make: the versions with some numbers.
+        count: how many there are.
+        images: in each of them.
+        arguments: as for :func:`jaxcal.calibrate`.
+    """
+    # Outliers were found with all images.
+    arguments = {**arguments, "robust": False}
+    size, parts = max(MOST_TOGETHER // images, 1), []
+    for start in range(0, count, size):
+        fits = calibrate_batch(make(jnp.arange(start, min(start + size, count))), **arguments)
+        short = replace(fits.linearisation, average_elevation_sd=None)
+        parts.append(replace(fits, problem=None, linearisation=short))
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
+
+
+@jax.jit
+def _rows(
+    root: Key[Array, ""], mask: Float[Array, " n"], resamples: Int[Array, " k"]
+) -> Int[Array, "k n"]:
+    """Used images drawn with replacement, for each of these resamples."""
     cumulative = jnp.cumsum(mask)
 
     def draw(index: Array) -> Array:
@@ -250,7 +279,7 @@ def _rows(root: Key[Array, ""], mask: Float[Array, " n"], resamples: int) -> Int
         chosen = jnp.searchsorted(cumulative, uniform * cumulative[-1], side="right")
         return jnp.minimum(chosen, mask.shape[0] - 1)
 
-    return jax.vmap(draw)(jnp.arange(resamples))
+    return jax.vmap(draw)(resamples)
 
 
 @jax.jit
