@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import tracemalloc
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -104,6 +105,30 @@ def test_a_chain_of_near_poses_is_no_hold():
         members = poses[group == number]
         assert displacement(members, members[:1]).max() <= 2.0
     assert 20 <= group.max() + 1 <= 41
+
+
+def test_a_sweep_between_other_poses_takes_none_of_them():
+    poses, swept = np.tile(np.eye(4), (36, 1, 1)), np.arange(36) % 3 == 0
+    poses[swept, 0, 3] = 0.8 * np.arange(12)
+    poses[~swept, 1, 3] = 50.0 * np.arange(1, 25)
+    group = same_pose(poses, np.ones(36, bool))
+    assert len(set(group[~swept])) == 24
+    assert not set(group[~swept]) & set(group[swept])
+    # A piece begins with a pose farther than 1 mm from the beginnings before it.
+    np.testing.assert_array_equal(group[swept], np.repeat(group[swept][::2], 2))
+
+
+def test_the_memory_for_a_long_hold_is_that_of_its_frames(frames):
+    made = frames.held(4, 800, np.random.default_rng(7))
+    tracemalloc.start()
+    try:
+        group = same_pose(made.poses, np.ones(3200, bool))
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    np.testing.assert_array_equal(group, np.repeat(np.arange(4), 800))
+    # All pairs of a hold would take 800 times as much.
+    assert peak < 50 * made.poses.nbytes
 
 
 def test_few_poses_are_refused_with_their_count(frames, tmp_path):

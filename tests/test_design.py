@@ -25,6 +25,7 @@ from jaxcal.design.candidates import seen_region, sobol_poses, sobol_sequence
 from jaxcal.design.criteria import check_criterion, curve, gains, rp_weight, tre_weight, weight_of
 from jaxcal.design.greedy import Rules, are_alike
 from jaxcal.design.information import Known, covariance_of, known_information
+from jaxcal.design.planning import make_search
 from jaxcal.diagnostics.sd_by_place import basis_at, log_sd_slopes
 
 MOUNT = np.eye(4)
@@ -189,7 +190,7 @@ def test_a_fifth_fills_space_and_replicates_are_capped():
     assert plan.filling.sum() == 5
     turns = (plan.poses[:, :3, :3] @ MOUNT[:3, :3]).reshape(-1, 9)
     for k in range(25):
-        assert are_alike(turns, plan.targets, turns[k], plan.targets[k], rules).sum() == 1
+        assert are_alike(turns, plan.targets, turns[[k]], plan.targets[[k]], rules).sum() == 1
     free = design.plan(candidates, 25, rules=Rules(space_filling=0.0, replicates=100))
     assert not free.filling.any()
     assert free.tre_mm[-1] < plan.tre_mm[-1]
@@ -319,6 +320,24 @@ def test_what_cannot_be_asked():
     ):  # fmt: skip
         with pytest.raises(InputError, match=match):
             call()
+
+
+def test_poses_that_are_alike_are_counted_once_for_each_image_in_use():
+    """All of several blocks of images, and none of those that a calibration left out."""
+    pool, taken = some(60), some(700, seed=1).poses
+    used = np.arange(700) % 3 > 0
+    pool = replace(pool, taken=taken, used=used)
+    rules = Rules(replicates=5, apart_deg=15.0, apart_mm=20.0)
+    search = make_search(pool, Known(MODEL.beliefs(), 400), "tre", rules)
+    others = np.concatenate([taken[used], pool.poses[[3, 7]]])
+    turns = Rotation.from_matrix(others[:, :3, :3])
+    angles = [(Rotation.from_matrix(p[:3, :3].T) * turns).magnitude() for p in pool.poses]
+    apart = np.linalg.norm(MODEL.targets(pool.poses)[:, None] - MODEL.targets(others), axis=-1)
+    alike = (np.degrees(angles) < rules.apart_deg) & (apart < rules.apart_mm)
+    assert alike.sum() > 100
+    np.testing.assert_array_equal(search.counts([3, 7]), alike.sum(axis=1))
+    alone = search.alike(search.rotations[3], search.places[3])
+    np.testing.assert_array_equal(search.counts([3]) - search.counts([]), alone)
 
 
 @pytest.mark.parametrize("model", [MODEL, Model()])

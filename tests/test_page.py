@@ -198,9 +198,24 @@ def test_wrong_frames_leave_nothing_to_copy(record, result, recording):
 
 def test_many_images_stay_small(result, recording):
     rng = np.random.default_rng(0)
-    drawn = svg.series([("offset (mm)", list(range(5000)), list(rng.normal(size=5000)), svg.BLUE)],
-                       [], "many")  # fmt: skip
-    assert len(drawn) < 6e5
+    for count in (5000, 20_000):
+        values = rng.normal(size=count)
+        drawn = svg.series([("offset (mm)", range(count), values, svg.BLUE)],
+                           range(0, count, 3), "many", spread=values**2)  # fmt: skip
+        assert len(drawn) < 6e5
+    shown = svg.drawn(values, np.array([7, 19_999]))
+    assert {7, 19_999, values.argmin(), values.argmax()} <= set(shown)
+    for part in np.array_split(np.arange(count), 100):
+        assert {values[part].min(), values[part].max()} <= set(values[shown])
+    assert len(shown) <= 2002
+    np.testing.assert_array_equal(svg.drawn(values[:2000], np.array([3])), np.arange(2000))
+    places = np.stack([np.arange(3000.0), np.full(3000, 20.0)], axis=1)
+    lateral, axial = np.meshgrid([0.0, 3000.0], [0.0, 3000.0])
+    across = [float(x) for x in re.findall(r'cx="([^"]*)"', svg.error_map(
+        lateral, axial, axial, places, "map"))]  # fmt: skip
+    assert 300 < len(across) <= 401
+    # Those of the whole recording, not of its beginning.
+    assert np.ptp(across) > 200
 
 
 @pytest.mark.parametrize("largest", [0.2, 0.45, 0.8, 0.99, 1.3, 2.1, 70.0])

@@ -15,6 +15,7 @@ from oracle.model import Data, Unknowns, errors
 from scipy.stats import multivariate_normal, norm
 
 import jaxcal
+from jaxcal.calibration import resampling
 from jaxcal.calibration.resampling import (
     _compared,
     _from_full_image,
@@ -75,7 +76,6 @@ def test_a_problem_of_numpy_arrays_where_64_bits_are_off():
     assert 0 < float(found.precision) < 10
 
 
-@pytest.mark.slow
 def test_a_bad_image_has_the_most_influence(data):
     spoilt = replace(data, measurements=data.measurements.at[4].add(jnp.asarray([6.0, 4.0])))
     found = cross_validate(spoilt, **CONVENTIONAL)
@@ -109,7 +109,6 @@ def test_folds_and_masked_images(data):
         cross_validate(few, **CONVENTIONAL)
 
 
-@pytest.mark.slow
 def test_bootstrap_scatters_as_the_covariance_says(data, whole):
     # Ten times 20 draws scatter about as one time 200.
     many = [bootstrap(data, COUNT, key, result=whole, **CONVENTIONAL) for key in range(10)]
@@ -198,6 +197,42 @@ def test_log_density_has_the_trackers_errors_in_it(data, whole):
         np.testing.assert_allclose(found.log_density[fold == k], expected, rtol=1e-9)
 
 
+def test_many_calibrations_are_solved_in_batches(data, whole, monkeypatch):
+    """Draws are the same in batches of any size, and no batch has more images than is set."""
+    asked, solve = [], resampling.calibrate_batch
+
+    def noted(problems, **arguments):
+        asked.append(problems.mask.shape)
+        return solve(problems, **arguments)
+
+    monkeypatch.setattr(resampling, "calibrate_batch", noted)
+    once = bootstrap(data, COUNT, result=whole, **CONVENTIONAL)
+    monkeypatch.setattr(resampling, "MOST_TOGETHER", COUNT * COUNT)
+    twice = bootstrap(data, 2 * COUNT, result=whole, **CONVENTIONAL)
+    assert asked == 3 * [(COUNT, COUNT)]
+    np.testing.assert_array_equal(twice.image_to_probe[:COUNT], once.image_to_probe)
+    assert len(np.unique(twice.image_to_probe, axis=0)) == 2 * COUNT
+
+
+def test_held_out_images_take_memory_by_their_number(data, whole):
+    """With two folds no array is as large as the square of the number of images."""
+    images = 16 * COUNT
+
+    def longer(leaf):
+        axes = [axis for axis, size in enumerate(leaf.shape) if size == COUNT]
+        return jnp.repeat(leaf, 16, axes[0]) if axes else leaf
+
+    data, whole = (jax.tree.map(longer, each) for each in (data, whole))
+    fits = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), whole)
+    traced = jax.make_jaxpr(_compared)(data, whole, fits, jnp.arange(images) % 2)
+    programs, found = [traced.jaxpr], []
+    while programs:
+        for equation in programs.pop().eqns:
+            found += [np.prod(out.aval.shape) for out in equation.outvars]
+            programs += [each.jaxpr for each in equation.params.values() if hasattr(each, "jaxpr")]
+    assert images * 16 <= max(found) < images**2
+
+
 def test_log_density_is_that_of_the_noise_model(data, whole):
     """With the images' own covariances and the mean of the offsets, where these were found."""
     sigma, tau, fold = np.array([0.3, 0.2, 1.0]), 0.5, np.arange(COUNT) % 2
@@ -249,7 +284,6 @@ def test_beside_the_calibrations_nothing_is_compiled(data, whole):
     assert not scatter.spread.any()
 
 
-@pytest.mark.slow
 def test_bootstrap_draws_used_images_only(data):
     half = replace(data, mask=data.mask.at[10:].set(0.0))
     wild = replace(half, measurements=half.measurements.at[10:].set(1e4))

@@ -194,17 +194,9 @@ def same_pose(
     """
     used = np.flatnonzero(mask)
     group = np.full(len(mask), -1)
-    # Points of a rigid body: between two poses none moves farther than the poses' displacement.
-    corners = np.concatenate(
-        [poses[used, :3, 3:], poses[used, :3, :3] * LEVER_MM + poses[used, :3, 3:]], axis=2
-    )
-    places = corners.transpose(0, 2, 1).reshape(len(used), 12)
-    first, second = _near_pairs(places, 2 * SAME_POSE_MM)
-    near = displacement(poses[used[first]], poses[used[second]]) <= SAME_POSE_MM
-    linked = _components(len(used), first[near], second[near])
-    label = np.arange(len(used))
-    for members in _members(linked):
-        label[members] = members[0] + _pieces(poses[used[members]])
+    label = _linked(poses[used])
+    for members in _members(label):
+        label[members] = members[_pieces(poses[used[members]])]
     _, order, inverse = np.unique(label, return_index=True, return_inverse=True)
     group[used] = np.argsort(np.argsort(order))[inverse]
     return group
@@ -220,29 +212,57 @@ def displacement(
     return shift + LEVER_MM * turn
 
 
-def _near_pairs(
-    places: Float[np.ndarray, "n 12"], limit: float
-) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
-    """Pairs whose coordinates all differ by less than the limit."""
-    empty = np.zeros(0, int)
-    if len(places) < 2:
-        return empty, empty
-    # Sorted by one coordinate, partners are few places apart; a second one rules out most others.
-    along, across = np.argsort(-np.ptp(places, axis=0))[:2]
-    order = np.argsort(places[:, along], kind="stable")
-    line, found = places[order], []
-    first, second = line[:, along].copy(), line[:, across].copy()
-    for apart in range(1, len(line)):
-        close = first[apart:] - first[:-apart] < limit
-        if not close.any():
-            break
-        at = np.flatnonzero(close & (np.abs(second[apart:] - second[:-apart]) < limit))
-        at = at[(np.abs(line[at + apart] - line[at]) < limit).all(axis=1)]
-        found.append(np.stack([order[at], order[at + apart]]))
-    if not found:
-        return empty, empty
-    pairs = np.concatenate(found, axis=1)
-    return pairs[0], pairs[1]
+def _linked(poses: Float[np.ndarray, "n 4 4"]) -> Int[np.ndarray, " n"]:
+    """For every pose, the least index of those that pairs of the same pose link it to.
+
+    Every pose is compared with the later ones of its own strip and those of the next strip. Strips
+    are of one coordinate and sorted by another; in them, poses that are known to be connected are
+    passed over, so that a long hold takes no more time and memory than as many different poses.
+    """
+    count, limit = len(poses), 2 * SAME_POSE_MM
+    label = np.arange(count)
+    if count < 2:
+        return label
+    first_axis, second_axis = _places(poses)[:2]
+    strip = np.floor(first_axis / limit)
+    order = np.lexsort((second_axis, strip))
+    poses, strip, second_axis = poses[order], strip[order], second_axis[order]
+    places = _places(poses).T
+    wide = np.ptp(second_axis) + 2 * limit
+    line = strip * wide + second_axis
+    pairs = np.zeros((2, 0), int)
+    for further in (0, 1):
+        at = np.arange(count)
+        other = np.searchsorted(line, line + wide - limit) if further else at + 1
+        end = np.searchsorted(line, line + further * wide + limit)
+        passed = _ends_of_runs(label)
+        while True:
+            at, other, end = (each[other < end] for each in (at, other, end))
+            if not len(at):
+                break
+            known = label[at] == label[other]
+            first, second = at[~known], other[~known]
+            near = (np.abs(places[first] - places[second]) < limit).all(axis=1)
+            first, second = first[near], second[near]
+            near = displacement(poses[first], poses[second]) <= SAME_POSE_MM
+            pairs = np.concatenate([pairs, [first[near], second[near]]], axis=1)
+            other = np.where(known, passed[other], other + 1)
+            if pairs.shape[1] > count // 8:
+                label, pairs = _components(count, *label[pairs])[label], pairs[:, :0]
+                passed = _ends_of_runs(label)
+        label, pairs = _components(count, *label[pairs])[label], pairs[:, :0]
+    least = np.full(count, count)
+    np.minimum.at(least, label, order)
+    found = np.empty(count, int)
+    found[order] = least[label]
+    return found
+
+
+def _ends_of_runs(label: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+    """For every place, the first one behind it with another label."""
+    starts = np.flatnonzero(np.diff(label)) + 1
+    ends = np.append(starts, len(label))
+    return ends[np.searchsorted(starts, np.arange(len(label)), side="right")]
 
 
 def _frozen(
@@ -282,24 +302,40 @@ def _components(
 def _members(label: Int[np.ndarray, " n"]) -> list[Int[np.ndarray, " m"]]:
     """The members of every component that has several."""
     order = np.argsort(label, kind="stable")
-    parts = np.split(order, np.flatnonzero(np.diff(label[order])) + 1)
-    return [part for part in parts if len(part) > 1]
+    _, starts, sizes = np.unique(label[order], return_index=True, return_counts=True)
+    several = sizes > 1
+    ends = starts + sizes
+    return [order[a:b] for a, b in zip(starts[several], ends[several], strict=True)]
 
 
 def _pieces(poses: Float[np.ndarray, "m 4 4"]) -> Int[np.ndarray, " m"]:
     """The piece of every pose: 0 for all of a hold; in a chain, the index of the piece's first."""
     if displacement(poses, poses[:1]).max() <= HOLD_MM:
         return np.zeros(len(poses), int)
-    leaders: list[int] = []
-    piece = np.zeros(len(poses), int)
-    for index, pose in enumerate(poses):
-        apart = displacement(poses[leaders], pose) if leaders else np.array([np.inf])
-        if apart.min() > SAME_POSE_MM:
-            leaders.append(index)
-            piece[index] = index
-        else:
-            piece[index] = leaders[int(np.argmin(apart))]
+    count, limit = len(poses), 2 * SAME_POSE_MM
+    first, second = _places(poses)[:2]
+    order = np.argsort(first)
+    starts, ends = np.searchsorted(first[order], [first - limit, first + limit])
+    piece, least = np.arange(count), np.full(count, np.inf)
+    for index in range(count):
+        if least[index] <= SAME_POSE_MM:
+            continue
+        near = order[starts[index] : ends[index]]
+        near = near[(near > index) & (np.abs(second[near] - second[index]) < limit)]
+        apart = displacement(poses[near], poses[index])
+        closer = (apart <= SAME_POSE_MM) & (apart < least[near])
+        piece[near[closer]], least[near[closer]] = index, apart[closer]
     return piece
+
+
+def _places(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "12 n"]:
+    """Coordinates of four points of the probe, mm, those that vary most first.
+
+    Between two poses none moves farther than twice their displacement.
+    """
+    corners = np.concatenate([poses[:, :3, 3:], poses[:, :3, :3] * LEVER_MM + poses[:, :3, 3:]], 2)
+    places = corners.reshape(len(poses), 12).T
+    return places[np.argsort(-np.ptp(places, axis=1))]
 
 
 def _representatives(
@@ -309,10 +345,9 @@ def _representatives(
     keep = np.zeros(len(group), bool)
     used = np.flatnonzero(mask)
     order = used[np.argsort(group[used], kind="stable")]
-    parts = np.split(order, np.flatnonzero(np.diff(group[order])) + 1) if len(order) else []
-    for part in parts:
-        keep[part[len(part) // 2]] = True
-    return IndependentImages(group, keep, frames=len(used), poses=len(parts))
+    _, starts, sizes = np.unique(group[order], return_index=True, return_counts=True)
+    keep[order[starts + sizes // 2]] = True
+    return IndependentImages(group, keep, frames=len(used), poses=len(starts))
 
 
 _AVERAGED = ("measurements", "covariance", "max_elevation", "amplitude", "time", "time_of_flight")
@@ -331,10 +366,9 @@ def _with_group_averages(data: Any, found: IndependentImages) -> Any:
         values["distances"] = np.array(channels.distances)
         values["heard"] = np.array(channels.heard)
     before = {name: each.copy() for name, each in values.items()}
-    for kept in np.flatnonzero(found.keep):
-        rows = np.flatnonzero(found.group == found.group[kept])
-        if len(rows) == 1:
-            continue
+    used = np.flatnonzero(found.group >= 0)
+    for rows in map(used.__getitem__, _members(found.group[used])):
+        kept = rows[found.keep[rows]][0]
         pose = before["poses"][rows].mean(axis=0)
         pose[:3, :3] = nearest_rotations(pose[None, :3, :3])[0][0]
         values["poses"][kept] = pose

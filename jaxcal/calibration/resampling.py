@@ -12,13 +12,13 @@ would compile it for every number of images, folds and resamples.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import fields, replace
 from functools import partial
 from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
@@ -51,6 +51,8 @@ T = TypeVar("T")
 
 LARGEST_RESAMPLES = 100_000
 """Most resamples of a bootstrap."""
+MOST_TOGETHER = 200_000
+"""Most images, over all calibrations, that are solved in one batch: about 1 GiB."""
 
 
 class CrossValidation(eqx.Module):
@@ -151,10 +153,12 @@ def cross_validate(
     fold = np.arange(count) % folds
     rest = fold != np.arange(folds)[:, None]
     _check_remaining(problem.mask, rest)
-    many = map_arrays(lambda leaf: xp.broadcast_to(leaf, (folds, *leaf.shape)), problem)
-    # Outliers were found with all images.
-    arguments["robust"] = False
-    fits = calibrate_batch(_placed(replace(many, mask=problem.mask * rest), given), **arguments)
+
+    def without(some: Int[np.ndarray, " k"]) -> Problem:
+        many = map_arrays(lambda leaf: xp.broadcast_to(leaf, (len(some), *leaf.shape)), problem)
+        return _placed(replace(many, mask=problem.mask * rest[some]), given)
+
+    fits = _in_batches(without, folds, count, arguments)
     compared = _compared if xp is np else jax.jit(_compared)
     return _placed(compared(problem, result, fits, fold), given)
 
@@ -164,7 +168,15 @@ def _compared(
 ) -> CrossValidation:
     """The calibrations of the folds against that of all images, and against the held-out images."""
     problem, result, fits, xp = _plain(problem, result, fits)
-    held = map_arrays(lambda leaf: leaf[fold], replace(fits, problem=None))
+    # Arrays of all images for each image would need memory by the square of their number.
+    few = replace(
+        fits,
+        mask=fits.mask[:, :1],
+        elevation=fits.elevation[:, :1],
+        problem=None,
+        linearisation=replace(fits.linearisation, average_elevation_sd=None),
+    )
+    held = map_arrays(lambda leaf: leaf[fold], few)
     errors, cloud = _held_out_errors(held, problem)
     mask = problem.mask
     used = xp.sum(mask)
@@ -226,25 +238,58 @@ def bootstrap(
         root = jax.random.key(whole_number("key", key, 0, LARGEST_SEED))
     given, result = problem, _full_calibration(problem, result, plan, arguments)
     problem, xp = _used(problem, result)
-    uniform = _uniform(root, problem.images, resamples, problem.mask.dtype)
     cumulative = xp.cumsum(problem.mask)
-    # The first image at which the count of used images exceeds the draw is always a used one.
-    chosen = xp.searchsorted(cumulative, xp.asarray(uniform) * cumulative[-1], side="right")
-    rows = xp.minimum(chosen, problem.images - 1)
-    # Each draw has as many images as were used, since the mask leaves out the other rows.
-    mask = xp.broadcast_to(problem.mask, rows.shape)
-    arguments["robust"] = False
-    fits = calibrate_batch(_placed(_with_rows(problem, rows, mask), given), **arguments)
+
+    def drawn(some: Int[np.ndarray, " k"]) -> Problem:
+        uniform = _uniform(root, some, problem.images, problem.mask.dtype)
+        # The first image at which the count of used images exceeds the draw is always a used one.
+        chosen = xp.searchsorted(cumulative, xp.asarray(uniform) * cumulative[-1], side="right")
+        rows = xp.minimum(chosen, problem.images - 1)
+        # Each draw has as many images as were used, since the mask leaves out the other rows.
+        mask = xp.broadcast_to(problem.mask, rows.shape)
+        return _placed(_with_rows(problem, rows, mask), given)
+
+    fits = _in_batches(drawn, resamples, problem.images, arguments)
     scatter = _scatter if xp is np else jax.jit(_scatter)
     return _placed(scatter(problem, result, fits), given)
 
 
-@partial(jax.jit, static_argnums=(1, 2, 3))
-def _uniform(root: Key[Array, ""], images: int, resamples: int, dtype: Any) -> Float[Array, "k n"]:
+@partial(jax.jit, static_argnums=(2, 3))
+def _uniform(
+    root: Key[Array, ""], resamples: Int[AnyArray, " k"], images: int, dtype: Any
+) -> Float[Array, "k n"]:
     """Uniform random numbers, those of a resample from a key of its own."""
     return jax.vmap(
         lambda index: jax.random.uniform(jax.random.fold_in(root, index), (images,), dtype)
-    )(jnp.arange(resamples))
+    )(resamples)
+
+
+def _in_batches(
+    make: Callable[[Int[np.ndarray, " k"]], Problem],
+    count: int,
+    images: int,
+    arguments: dict[str, Any],
+) -> Calibration:
+    """Calibrations of many versions of a problem, without their data.
+
+    Args:
+        make: the versions with some numbers.
+        count: how many there are.
+        images: in each of them.
+        arguments: as for :func:`jaxcal.calibrate`.
+    """
+    # Outliers were found with all images.
+    arguments = {**arguments, "robust": False}
+    size, parts = max(MOST_TOGETHER // images, 1), []
+    for start in range(0, count, size):
+        some = np.arange(start, min(start + size, count))
+        fits = calibrate_batch(make(some), **arguments)
+        short = replace(fits.linearisation, average_elevation_sd=None)
+        parts.append(replace(fits, problem=None, linearisation=short))
+    if len(parts) == 1:
+        return parts[0]
+    xp = array_module(parts)
+    return jax.tree.map(lambda *leaves: xp.concatenate(leaves), *parts)
 
 
 def _scatter(problem: Problem, result: Calibration, fits: Calibration) -> Bootstrap:

@@ -95,6 +95,12 @@ class Candidates:
         return len(self.poses)
 
     @property
+    def taken_and_used(self) -> Float[np.ndarray, "k 4 4"]:
+        """Poses of the images taken already, without those that the calibration left out."""
+        taken = np.zeros((0, 4, 4)) if self.taken is None else self.taken
+        return taken if self.used is None else taken[np.asarray(self.used) > 0]
+
+    @property
     def numbers(self) -> Float[np.ndarray, "m 5"]:
         """The five numbers of each pose."""
         model = self.model

@@ -40,6 +40,8 @@ _PASSES = 2
 """Largest number of passes of the exchange over all poses."""
 _SHORTLIST = 600
 _LEAST_GAIN = 1e-6
+_TOGETHER = 256
+"""Number of poses that are compared with the candidates at a time."""
 
 
 @dataclass(frozen=True)
@@ -111,29 +113,40 @@ class Search:
         self, rotation: Float[np.ndarray, " 9"], place: Float[np.ndarray, 3]
     ) -> Bool[np.ndarray, " m"]:
         """Which candidates are replicates of a pose."""
-        return are_alike(self.rotations, self.places, rotation, place, self.rules)
+        return are_alike(self.rotations, self.places, rotation[None], place[None], self.rules)[:, 0]
 
     def counts(self, rows: Sequence[int]) -> Float[np.ndarray, " m"]:
         """For each candidate, how many poses are alike: images taken already and these rows."""
         found = np.zeros(len(self.rotations))
-        for rotation, place in zip(self.taken_rotations, self.taken_places, strict=True):
-            found += self.alike(rotation, place)
-        for row in rows:
-            found += self.alike(self.rotations[row], self.places[row])
+        rotations = np.concatenate([self.taken_rotations, self.rotations[rows]])
+        places = np.concatenate([self.taken_places, self.places[rows]])
+        # Poses that are alike have the target within a short stretch along the image.
+        order, apart = np.argsort(places[:, 0]), self.rules.apart_mm
+        for start in range(0, len(order), _TOGETHER):
+            others = order[start : start + _TOGETHER]
+            left, right = places[others[[0, -1]], 0] + [-apart, apart]
+            near = np.flatnonzero((self.places[:, 0] >= left) & (self.places[:, 0] <= right))
+            turns, seen = self.rotations[near], self.places[near]
+            alike = are_alike(turns, seen, rotations[others], places[others], self.rules)
+            found[near] += alike.sum(axis=1)
         return found
 
 
 def are_alike(
     rotations: Float[np.ndarray, "m 9"],
     places: Float[np.ndarray, "m 3"],
-    rotation: Float[np.ndarray, " 9"],
-    place: Float[np.ndarray, 3],
+    other_rotations: Float[np.ndarray, "t 9"],
+    other_places: Float[np.ndarray, "t 3"],
     rules: Rules,
-) -> Bool[np.ndarray, " m"]:
-    """Which poses are like one other pose."""
-    cosine = 0.5 * (rotations @ rotation - 1)
-    near = cosine > np.cos(np.radians(rules.apart_deg))
-    return near & (((places - place) ** 2).sum(axis=1) < rules.apart_mm**2)
+) -> Bool[np.ndarray, "m t"]:
+    """Which poses are like which others."""
+    apart = ((places.T[:, :, None] - other_places.T[:, None]) ** 2).sum(axis=0)
+    found = apart < rules.apart_mm**2
+    # Few have the target in the same place, and only of these are the angles needed.
+    one, other = np.nonzero(found)
+    cosine = 0.5 * (np.einsum("pk,pk->p", rotations[one], other_rotations[other]) - 1)
+    found[one, other] = cosine > np.cos(np.radians(rules.apart_deg))
+    return found
 
 
 def space_features(candidates: Candidates) -> Float[np.ndarray, "m 5"]:

@@ -277,9 +277,7 @@ def make_search(candidates: Candidates, known: Known, criterion: Criterion, rule
     factors = hypotheses(model.noise.doubt)
     rows = model.jacobian(candidates.poses)
     before = np.repeat(known.information[None], len(factors), axis=0)
-    taken = np.zeros((0, 4, 4))
-    if known.images > 0 and candidates.taken is not None:
-        taken = candidates.taken
+    taken = candidates.taken_and_used[: None if known.images > 0 else 0]
     x = model.image_to_probe[:3, :3]
     return Search(
         rows=rows[None] / factors[:, None, :, None],
@@ -296,9 +294,8 @@ def make_search(candidates: Candidates, known: Known, criterion: Criterion, rule
 
 def _taken_features(candidates: Candidates) -> Float[np.ndarray, "t 5"]:
     """Space features of the images taken already."""
-    if candidates.taken is None or not len(candidates.taken):
-        return np.zeros((0, 5))
-    return space_features(replace(candidates, poses=candidates.taken))
+    taken = candidates.taken_and_used
+    return space_features(replace(candidates, poses=taken)) if len(taken) else np.zeros((0, 5))
 
 
 def check_candidates(candidates: Candidates) -> None:
@@ -308,9 +305,7 @@ def check_candidates(candidates: Candidates) -> None:
         InputError: they would not; the message has the direction and a kind of pose that helps.
     """
     model = replace(candidates.model, noise=Noise.constant((1.0, 1.0, 1.0)))
-    every = candidates.poses
-    if candidates.taken is not None:
-        every = np.concatenate([every, candidates.taken])
+    every = np.concatenate([candidates.poses, candidates.taken_and_used])
     log_sd = candidates.model.noise.log_sigma(model.targets(candidates.poses))
     low, high = SD_RANGE_MM
     if log_sd.min() < np.log(low) or log_sd.max() > np.log(high):

@@ -122,7 +122,7 @@ def polish(search: Search, candidates: Candidates, chosen: Chosen) -> Float[np.n
         return float(value), np.asarray(slope)
 
     def among_too_many(k: int, pose: np.ndarray) -> bool:
-        turn, place = (pose[:3, :3] @ x[:3, :3]).reshape(9), model.targets(pose)
+        turn, place = (pose[:3, :3] @ x[:3, :3]).reshape(1, 9), model.targets(pose)[None]
         others = np.arange(len(poses)) != k
         near = are_alike(rotations[others], places[others], turn, place, search.rules).sum()
         near += are_alike(

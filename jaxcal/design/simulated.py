@@ -147,10 +147,9 @@ def simulate_errors(
 def _with_taken(plan: Plan) -> Float[np.ndarray, "n 4 4"]:
     """The poses of a plan after those of the images that its calibration used."""
     before = plan.candidates
-    if plan.known.images == 0 or before.taken is None:
+    if plan.known.images == 0:
         return plan.poses
-    taken = before.taken if before.used is None else before.taken[np.asarray(before.used) > 0]
-    return np.concatenate([taken, plan.poses])
+    return np.concatenate([before.taken_and_used, plan.poses])
 
 
 def _recordings(

@@ -3,17 +3,18 @@
 Let R_i be the whitened derivatives of image i's errors e_i by the unknowns, S_i = R_i'R_i and
 S = sum S_i (plus the information of priors). Then, to first order:
 
-*Leaving an image out* moves the unknowns by (S - S_i)^-1 R_i'e_i. If the model holds, this move has
-the covariance (S - S_i)^-1 - S^-1. So no further solve is needed to see how much an image moves the
-answer, and whether that is more than expected.
+*Leaving an image out* moves the unknowns by (S - S_i)^-1 R_i'e_i = S^-1 R_i'(I - H_i)^-1 e_i with
+the leverages H_i = R_i S^-1 R_i'. If the model holds, this move has the covariance
+(S - S_i)^-1 - S^-1 = S^-1 R_i'(I - H_i)^-1 R_i S^-1. So no further solve is needed to see how much
+an image moves the answer, and whether that is more than expected.
 
 *Kinds of errors.* S is the sum of the information from lateral position, range and offset:
 S = sum S_k. The covariance S^-1 = sum S^-1 S_k S^-1 then shows how much comes from each kind.
 
 *What the residuals say.* S^-1 (sum R_i'(I - H_i)^-1/2 e_i e_i'(I - H_i)^-1/2 R_i + P) S^-1 with
-the leverages H_i = R_i S^-1 R_i' and the priors' information P has the expectation S^-1 if the
-model holds, and is a valid covariance even if it does not: it is larger where a few images pull, or
-where errors are large in images that matter.
+the priors' information P has the expectation S^-1 if the model holds, and is a valid covariance
+even if it does not: it is larger where a few images pull, or where errors are large in images that
+matter.
 
 All this is of the errors one by one: S is the information before errors that are alike in
 successive images reduced it (:mod:`jaxcal.calibration.serial_correlation`).
@@ -67,7 +68,8 @@ class Influence:
     Attributes:
         moved: by how much the unknowns move if the image is left out; 0 where it is not in use, NaN
             where the other images do not determine all unknowns.
-        expected: covariance of ``moved``, if the model holds; NaN where ``moved`` is.
+        expected: E, with the covariance E'E of ``moved`` if the model holds; NaN where ``moved``
+            is.
         shares: the part of the covariance that comes from each of :data:`KINDS`.
         residual_covariance: covariance of the unknowns, estimated from the residuals.
         residual_rows: R_i S^-1: how far each error moves the unknowns per SD.
@@ -77,7 +79,7 @@ class Influence:
     """
 
     moved: Float[Array, "n p"]
-    expected: Float[Array, "n p p"]
+    expected: Float[Array, "n k p"]
     shares: Float[Array, "3 p p"]
     residual_covariance: Float[Array, "p p"]
     residual_rows: Float[Array, "n k p"]
@@ -144,33 +146,28 @@ def _influence(
     """Influence of whitened errors and a prior of this precision, from which the answer is away."""
     rows, errors = found.rows, found.errors
     components = rows.shape[1]
-    each = np.swapaxes(rows, 1, 2) @ rows
-    information = each.sum(axis=0) + np.diag(precision)
+    by_kind = np.einsum("mkp,mkq->kpq", rows, rows)
+    information = by_kind.sum(axis=0) + np.diag(precision)
     inverse = inverses(information[None], np.finfo(float).eps)[0]
     if not at_minimum:
         # An answer averaged over laws, or an alternation that stopped early, does not minimise
         # these errors: take them at the minimum.
         gradient = np.einsum("mkp,mk->p", rows, errors) + precision * away
         errors = errors - np.einsum("mkp,p->mk", rows, inverse @ gradient)
-    pull = np.einsum("mkp,mk->mp", rows, errors)
-    without = inverses(information - each, np.finfo(float).eps)
-    moved = np.einsum("mpq,mq->mp", without, pull)
-    by_kind = np.stack(
-        [
-            np.einsum("mkp,mkq->pq", rows[:, found.kind == kind], rows[:, found.kind == kind])
-            for kind in range(len(KINDS))
-        ]
-    )
+    by_kind = np.stack([by_kind[found.kind == kind].sum(axis=0) for kind in range(len(KINDS))])
 
-    leverage = rows @ inverse @ np.swapaxes(rows, 1, 2)
+    steps = rows @ inverse
+    leverage = steps @ np.swapaxes(rows, 1, 2)
     values, vectors = np.linalg.eigh(np.eye(components) - 0.5 * (leverage + leverage.mT))
     # Without an image that alone determines a direction there is no answer to move to.
     alone = (values <= _LEAST_LEFT).any(axis=1)
-    moved[alone], without[alone] = np.nan, np.nan
     values = np.maximum(values, _LEAST_LEFT)
     turned = np.einsum("mkl,mk->ml", vectors, errors)
-    unbiased = np.einsum("mkl,ml->mk", vectors, turned / np.sqrt(values))
-    steps = np.einsum("mk,mkp->mp", unbiased, rows) @ inverse
+    # (I - H)^-1/2 R S^-1, in the directions of the eigenvectors.
+    expected = (vectors / np.sqrt(values)[:, None]).mT @ steps
+    residual = np.einsum("mk,mkp->mp", turned, expected)
+    moved = np.einsum("mk,mkp->mp", turned / np.sqrt(values), expected)
+    moved[alone], expected[alone] = np.nan, np.nan
     # Predicted from the others, an error is (I - H)^-1 e, with the covariance (I - H)^-1.
     density = -0.5 * np.sum(turned**2 / values, axis=1) + 0.5 * np.sum(np.log(values), axis=1)
     density = density - 0.5 * components * np.log(2 * np.pi) - found.log_sd
@@ -182,10 +179,10 @@ def _influence(
 
     return Influence(
         moved=everywhere(moved),
-        expected=everywhere(without - inverse),
+        expected=everywhere(expected),
         shares=inverse @ by_kind @ inverse,
-        residual_covariance=steps.T @ steps + inverse * precision @ inverse,
-        residual_rows=everywhere(rows @ inverse),
+        residual_covariance=residual.T @ residual + inverse * precision @ inverse,
+        residual_rows=everywhere(steps),
         model_covariance=inverse,
         log_density=everywhere(density),
     )
@@ -348,5 +345,5 @@ def in_image(
         NaN where the other images do not determine all unknowns.
     """
     moved = quadratic(found.moved[None], weight[None])[0]
-    expected = np.einsum("npq,pq->n", found.expected, weight)
+    expected = np.sum(found.expected @ weight * found.expected, axis=(1, 2))
     return np.sqrt(np.maximum(moved, 0.0)), np.sqrt(np.maximum(expected, 0.0))

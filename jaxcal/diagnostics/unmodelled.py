@@ -115,12 +115,19 @@ def unmodelled(calibration: Calibration) -> list[Unmodelled]:
         return []
     answer = map_arrays(lambda leaf: np.asarray(leaf)[None], calibration.numpy())
     seen = ImageErrors.of_answer(answer).centred(answer)
-    found = []
+    columns = _columns(seen, used)
+    rows = np.concatenate([seen.rows[0], *columns.values()], axis=-1)[None]
+    found, count = [], seen.rows.shape[-1]
     with np.errstate(all="ignore"):
-        for kind, columns in _columns(seen, used).items():
-            rows = np.concatenate([seen.rows, columns[None]], axis=-1)
-            whitened = Whitened.of(answer, replace(seen, rows=rows))
-            each = _fit(kind, whitened.errors[0][used], whitened.rows[0][used])
+        whitened = Whitened.of(answer, replace(seen, rows=rows))
+        both = np.concatenate([whitened.rows, whitened.errors[..., None]], axis=-1)[0][used]
+        # The triangle of each kind's rows and errors has the same sums of squares as all images.
+        triangle = np.asarray(np.linalg.qr(np.swapaxes(both, 0, 1), mode="r"))
+        rows, errors = np.swapaxes(triangle[..., :-1], 0, 1), triangle[..., -1].T
+        for kind in columns:
+            own = count + np.arange(_FREEDOM[kind])
+            each = _fit(kind, errors, rows[..., np.r_[: seen.rows.shape[-1], own]], int(used.sum()))
+            count += _FREEDOM[kind]
             if each is not None:
                 found.append(each)
     return sorted(found, key=lambda each: -each.statistic / _BY_CHANCE[each.kind])
@@ -147,14 +154,16 @@ def _columns(seen: ImageErrors, used: Bool[Array, " n"]) -> dict[str, Float[Arra
     return {kind: np.where(used[:, None, None], value, 0.0) for kind, value in found.items()}
 
 
-def _fit(kind: str, errors: Float[Array, "m 3"], rows: Float[Array, "m 3 q"]) -> Unmodelled | None:
-    """The further parameters, the last of the columns, if the residuals show them."""
+def _fit(
+    kind: str, errors: Float[Array, "m 3"], rows: Float[Array, "m 3 q"], images: int
+) -> Unmodelled | None:
+    """The further parameters, the last of the columns, if the residuals of the images show them."""
     unknowns = rows.shape[-1] - _FREEDOM[kind]
-    before, _ = _tuned(errors, rows[..., :unknowns])
-    after, step = _tuned(errors, rows)
+    before, _ = _tuned(errors, rows[..., :unknowns], images)
+    after, step = _tuned(errors, rows, images)
     # Every kind gives a third of the unknowns' degrees of freedom, and its part of theta's.
     touched = np.any(rows[..., unknowns:] != 0, axis=(0, 2))
-    freedom = len(errors) - unknowns / 3 - touched * (_FREEDOM[kind] / touched.sum())
+    freedom = images - unknowns / 3 - touched * (_FREEDOM[kind] / touched.sum())
     statistic = float(np.sum(freedom * np.log(before / after)))
     if not statistic > _BY_CHANCE[kind]:
         return None
@@ -170,20 +179,16 @@ def _fit(kind: str, errors: Float[Array, "m 3"], rows: Float[Array, "m 3 q"]) ->
 
 
 def _tuned(
-    errors: Float[Array, "m 3"], rows: Float[Array, "m 3 q"]
+    errors: Float[Array, "m 3"], rows: Float[Array, "m 3 q"], images: int
 ) -> tuple[Float[Array, " 3"], Float[Array, " q"]]:
     """Mean squared errors of each kind after the fit with tuned SDs, and the step."""
     scale = 1 / np.sqrt(np.maximum(np.sum(rows**2, axis=(0, 1)), 1e-300))
     variance = np.ones(3)
     step = np.zeros(rows.shape[-1])
-    # The triangle of each kind's rows and errors has the same sums of squares as all images.
-    count, both = len(errors), np.concatenate([rows, errors[..., None]], axis=-1)
-    triangle = np.asarray(np.linalg.qr(np.swapaxes(both, 0, 1), mode="r"))
-    rows, errors = np.swapaxes(triangle[..., :-1], 0, 1), triangle[..., -1].T
     for _ in range(_ROUNDS):
         weight = 1 / np.sqrt(variance)[:, None]
         design = (rows * scale * weight).reshape(-1, rows.shape[-1])
         step = -scale * np.linalg.lstsq(design, (errors * weight[:, 0]).ravel(), rcond=1e-12)[0]
         left = errors + rows @ step
-        variance = np.maximum(np.sum(left**2, axis=0) / count, 1e-12)
+        variance = np.maximum(np.sum(left**2, axis=0) / images, 1e-12)
     return variance, step

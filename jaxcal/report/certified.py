@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.calibration.dependence import independent
 from jaxcal.data.recording import Images, Recording
 from jaxcal.data.sound import WATER_M_S
 from jaxcal.model.unknowns import FURTHER
@@ -24,16 +23,18 @@ def certificate_record(result: Calibration, recording: Recording) -> dict[str, A
     For the conventional method they are those of the answer. The other methods minimise a different
     objective; for them they are those of the closed form on the same images. Both are None if there
     is no closed form (e.g. an estimated delay) or no answer.
+
+    Args:
+        result: of one problem.
+        recording: with the images of the solve (:func:`jaxcal.report.accuracy.as_solved`).
     """
     nothing: dict[str, Any] = {"certified": None, "gap_mm2": None}
-    images = recording.calibration
+    images = replace(recording.calibration, mask=np.asarray(result.mask) > 0)
     estimate = tuple(name for name in FURTHER if name in result.blocks)
     own = result.method == "conventional"
     if not (estimate in ((), ("scale",)) or own):
         return nothing
     try:
-        # The solve counted every pose once, so the certificate must do the same.
-        images = replace(independent(images, estimate)[0], mask=np.asarray(result.mask) > 0)
         if own:
             found = _of_answer(result, images, recording, estimate)
         else:

@@ -435,12 +435,11 @@ def _rounded(values: Any) -> Any:
 def _residuals(record: dict[str, Any], answer: Calibration) -> str:
     used = np.flatnonzero(np.asarray(answer.mask) > 0)
     suspected = (each["image"] for each in record["suspects"])
-    named = [image for image in (*outliers(answer), *suspected) if image in used]
+    named = set(used.tolist()) & {*outliers(answer), *suspected}
     residual = np.asarray(answer.residual)[used]
-    images = used.astype(float).tolist()
     first = svg.series(
         [
-            (f"{name} (mm)", images, residual[:, axis].tolist(), colour)
+            (f"{name} (mm)", used, residual[:, axis], colour)
             for name, axis, colour in (
                 ("lateral", 0, svg.BLUE),
                 ("axial", 2, svg.GREEN),
@@ -453,10 +452,10 @@ def _residuals(record: dict[str, Any], answer: Calibration) -> str:
     )
     offset = np.asarray(answer.elevation)[used]
     second = svg.series(
-        [("offset (mm)", images, offset.tolist(), svg.ORANGE)],
+        [("offset (mm)", used, offset, svg.ORANGE)],
         named,
         "Estimated offset of the target from the image plane, mm",
-        spread=np.asarray(answer.elevation_sd)[used].tolist(),
+        spread=np.asarray(answer.elevation_sd)[used],
         height=120.0,
     )
     known = bool(np.isfinite(np.asarray(answer.elevation_sd)[used]).any())
@@ -484,9 +483,15 @@ def _residuals(record: dict[str, Any], answer: Calibration) -> str:
             "left out (to first order). Rings: the three images with the largest effect."
             "</figcaption></figure>"
         )
-    words = _paragraphs([*frames_of_images(record), *resampled_sentences(record)])
+    words = [*frames_of_images(record), *resampled_sentences(record)]
+    if len(used) > svg.MOST_DRAWN:
+        words.insert(
+            0,
+            f"Of {len(used)} images the figures show those with the least and the greatest value "
+            f"of each {-(-2 * len(used) // svg.MOST_DRAWN)} successive ones.",
+        )
     columns = "".join(f"<div>{part}</div>" for part in parts)
-    return _section("Image by image", f'<div class="grid">{columns}</div>', words)
+    return _section("Image by image", f'<div class="grid">{columns}</div>', _paragraphs(words))
 
 
 def _limits(record: dict[str, Any]) -> str:
@@ -601,9 +606,10 @@ def _facts(record: dict[str, Any]) -> str:
         *frames_and_target(record),
         *further_facts(record),
     ]
+    short = "" if record["images"] <= LONGEST_LIST else ", without the values of every image"
     return _section(
         "Facts",
         _table([(escape(name), escape(value.replace("+-", "±"))) for name, value in rows], words=2),
-        '<p class="soft">The whole record of the calibration is inside this page '
+        f'<p class="soft">The whole record of the calibration{short} is inside this page '
         "(the element with the id record).</p>",
     )

@@ -24,7 +24,7 @@ from jaxcal.model.image_points import mean_of_squares
 from jaxcal.report.accuracy import error_shares, region_of, scatter_shares
 from jaxcal.report.convergence import Curve
 from jaxcal.report.summary import recording_of
-from jaxcal.report.svg import bar_length
+from jaxcal.report.svg import MOST_DRAWN, bar_length, drawn
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.given_values import real_array
@@ -77,7 +77,7 @@ def plot_tre(calibration: Calibration, factor: float = 1.0) -> Figure:
     # Axes of equal scale shrink after they are laid out, and only this layout sees it.
     figure.set_layout_engine("compressed")
     axes = styled(figure.subplots())
-    drawn = axes.pcolormesh(
+    mesh = axes.pcolormesh(
         cells[..., 0], cells[..., 1], error, cmap="viridis", shading="gouraud", rasterized=True
     )
     lines = axes.contour(
@@ -86,11 +86,12 @@ def plot_tre(calibration: Calibration, factor: float = 1.0) -> Figure:
     axes.clabel(lines, fontsize=6, fmt="%.3g")
     poses = recording.calibration.poses[np.asarray(answer.mask) > 0]
     seen = targets_in_images(poses, answer.image_to_probe, answer.point)
+    seen = seen[:: -(-len(seen) // MOST_DRAWN) or 1]
     axes.plot(seen[:, 0], seen[:, 2], "o", ms=1.8, mfc="white", mec="black", mew=0.4)
     axes.set_aspect("equal")
     axes.invert_yaxis()
     axes.set(xlabel="lateral (mm)", ylabel="depth (mm)")
-    bar = figure.colorbar(drawn, ax=axes, shrink=0.8)
+    bar = figure.colorbar(mesh, ax=axes, shrink=0.8)
     bar.set_label("target registration error (mm)", size=8)
     bar.ax.tick_params(labelsize=7, width=0.6)
     bar.outline.set_linewidth(0.6)  # pyright: ignore[reportCallIssue]
@@ -113,12 +114,14 @@ def plot_residuals(calibration: Calibration) -> Figure:
     ):
         styled(panel)
         panel.axhline(0.0, color=GREY, linewidth=0.5)
-        panel.vlines(used, 0.0, residual[used, axis], color=COLOURS[name], linewidth=0.7)
-        panel.plot(used, residual[used, axis], "o", color=COLOURS[name], ms=2.2)
+        shown = used[drawn(residual[used, axis], np.searchsorted(used, named))]
+        panel.vlines(shown, 0.0, residual[shown, axis], color=COLOURS[name], linewidth=0.7)
+        panel.plot(shown, residual[shown, axis], "o", color=COLOURS[name], ms=2.2)
         if len(named):
+            ringed = np.intersect1d(named, shown)
             panel.plot(
-                named,
-                residual[named, axis],
+                ringed,
+                residual[ringed, axis],
                 "o",
                 ms=6,
                 mfc="none",
@@ -155,10 +158,12 @@ def plot_offsets(calibration: Calibration, truth: Float[np.ndarray, " n"] | None
     styled(panel).axhline(0.0, color=GREY, linewidth=0.5)
     spread = np.nan_to_num(np.asarray(answer.elevation_sd)[used], nan=0.0)
     offset = np.asarray(answer.elevation)[used]
+    resting = np.flatnonzero(np.asarray(answer.at_bound)[used] > 0)
+    shown = drawn(offset, resting)
     panel.errorbar(
-        used,
-        offset,
-        yerr=spread,
+        used[shown],
+        offset[shown],
+        yerr=spread[shown],
         fmt="o",
         color=ORANGE,
         ecolor=GREY,
@@ -166,11 +171,11 @@ def plot_offsets(calibration: Calibration, truth: Float[np.ndarray, " n"] | None
         linewidth=0.7,
         label="estimated, with one SD",
     )
-    resting = used[np.asarray(answer.at_bound)[used] > 0]
+    resting = np.intersect1d(resting, shown)
     if len(resting):
         panel.plot(
-            resting,
-            np.asarray(answer.elevation)[resting],
+            used[resting],
+            offset[resting],
             "s",
             ms=5,
             mfc="none",
@@ -179,7 +184,7 @@ def plot_offsets(calibration: Calibration, truth: Float[np.ndarray, " n"] | None
             label="at its bound",
         )
     if truth is not None:
-        panel.plot(used, truth[used], "x", color="black", ms=3, mew=0.7, label="true")
+        panel.plot(used[shown], truth[used[shown]], "x", color="black", ms=3, mew=0.7, label="true")
     _legend(panel)
     panel.set(xlabel="image", ylabel="elevational offset (mm)")
     styled(side).hist(offset, bins="fd", orientation="horizontal", color=ORANGE, alpha=0.8)
@@ -195,18 +200,20 @@ def plot_influence(calibration: Calibration) -> Figure:
     used = np.flatnonzero(np.asarray(answer.mask) > 0)
     figure = canvas(PAGE_MM, 60.0)
     panel = styled(figure.subplots())
-    panel.vlines(used, 0.0, moved[used], color=BLUE, linewidth=0.8)
-    panel.plot(used, moved[used], "o", color=BLUE, ms=2.4, label="by leaving it out")
+    most = used[np.argsort(-moved[used])[:3]]
+    shown = used[drawn(moved[used], np.searchsorted(used, most))]
+    panel.vlines(shown, 0.0, moved[shown], color=BLUE, linewidth=0.8)
+    panel.plot(shown, moved[shown], "o", color=BLUE, ms=2.4, label="by leaving it out")
     panel.plot(
-        used,
-        expected[used],
+        shown,
+        expected[shown],
         "_",
         color="black",
         ms=4,
         mew=0.8,
         label="if the noise model holds (SD)",
     )
-    for image in used[np.argsort(-moved[used])[:3]]:
+    for image in most:
         panel.annotate(
             str(image),
             (image, moved[image]),

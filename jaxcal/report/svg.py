@@ -14,11 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.array_types import Float, Int
 
 Number = float | int | np.floating
 
 WIDTH = 380.0
+MOST_DRAWN = 2000
+"""Most images of one curve: more than three for each unit of a figure's width."""
+MOST_PLACES = 400
+"""Most places of the target in a map."""
 BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#8a8a8a"
 
 _VIRIDIS = (
@@ -33,6 +37,23 @@ _VIRIDIS = (
     (253, 231, 37),
 )
 """Nine colours of matplotlib's viridis (public domain, CC0), with even steps of lightness."""
+
+
+def drawn(values: Float[np.ndarray, " n"], marked: Int[np.ndarray, " m"]) -> Int[np.ndarray, " k"]:
+    """Places of the images to draw: all, or of many the extremes, which look the same.
+
+    Args:
+        values: of the images, in their order.
+        marked: places of images that are to be seen; of many of these, too, only the extremes.
+    """
+
+    def extremes(among: Int[np.ndarray, " m"]) -> Any:
+        if len(among) <= MOST_DRAWN:
+            return among
+        parts = [(part, values[part]) for part in np.array_split(among, MOST_DRAWN // 2)]
+        return [part[end(each)] for part, each in parts for end in (np.argmin, np.argmax)]
+
+    return np.union1d(extremes(np.arange(len(values))), extremes(marked)).astype(int)
 
 
 def viridis(share: Number) -> str:
@@ -184,7 +205,7 @@ class Panel:
         return parts
 
     def stems(
-        self, x: Sequence[Any], y: Sequence[Any], colour: str, titles: Sequence[str]
+        self, x: Iterable[Any], y: Iterable[Any], colour: str, titles: Sequence[str]
     ) -> list[str]:
         """Points with a line to zero; all lines are one path, and a dot has a title."""
         zero = min(max(0.0, self.y[0]), self.y[1])
@@ -195,7 +216,7 @@ class Panel:
             dots.append(circle(across, down, 1.9, f'fill="{colour}"', title))
         return [f'<path d="{"".join(moves)}" stroke="{colour}" stroke-width="0.7"/>', *dots]
 
-    def bars(self, x: Sequence[Any], low: Sequence[Any], high: Sequence[Any], colour: str) -> str:
+    def bars(self, x: Iterable[Any], low: Iterable[Any], high: Iterable[Any], colour: str) -> str:
         """Vertical intervals, as one path."""
         moves = []
         for a, b, c in zip(x, low, high, strict=True):
@@ -205,23 +226,25 @@ class Panel:
 
 
 def series(
-    panels: Sequence[tuple[str, Sequence[Any], Sequence[Any], str]],
-    marked: Sequence[Any],
+    panels: Sequence[tuple[str, Any, Any, str]],
+    marked: Iterable[int],
     label: str,
     *,
-    spread: Sequence[Any] | None = None,
+    spread: Any = None,
     height: Number = 96.0,
 ) -> str:
     """Panels one above the other, with one scale for all; each shows a value of every image.
 
     Args:
-        panels: name with unit, image numbers, values, colour.
+        panels: name with unit, image numbers, values, colour; of many images the extremes are
+            drawn (:func:`drawn`).
         marked: images to mark.
         label: of the figure.
         spread: half-lengths of vertical bars in every panel.
         height: of one panel.
     """
-    values = np.array([v for _, _, column, _ in panels for v in column if math.isfinite(v)])
+    values = np.concatenate([np.asarray(column, float) for _, _, column, _ in panels])
+    values = values[np.isfinite(values)]
     half = None if spread is None else np.nan_to_num(np.asarray(spread, float))
     if half is not None and len(values):
         wide = float(np.abs(half).max())
@@ -232,7 +255,7 @@ def series(
     scale = (low - margin if low < 0 else 0.0, high + margin)
     images = np.concatenate([np.asarray(x, float) for _, x, _, _ in panels])
     first, last = (float(images.min()), float(images.max())) if len(images) else (0.0, 1.0)
-    parts: list[str] = []
+    parts, rings = [], list(marked)
     for k, (name, x, y, colour) in enumerate(panels):
         top = 8.0 + k * (height + 12.0)
         panel = Panel((48.0, top, 374.0, top + height), (first - 1, last + 1), scale)
@@ -240,14 +263,17 @@ def series(
         parts += panel.axes(below, name, x_ticks=(first, last))
         zero = panel.place(first, 0.0)[1]
         parts.append(line(48.0, zero, 374.0, zero, "var(--text)", 0.6))
+        ringed = np.isin(np.asarray(x, int), rings)
+        shown = drawn(np.asarray(y, float), np.flatnonzero(ringed))
+        ringed = ringed[shown]
+        x, y = np.asarray(x, float)[shown], np.asarray(y, float)[shown]
         if half is not None:
-            column = np.asarray(y, float)
-            parts.append(panel.bars(list(x), list(column - half), list(column + half), GREY))
+            parts.append(panel.bars(x, y - half[shown], y + half[shown], GREY))
         pairs = list(zip(x, y, strict=True))
         titles = [f"image {int(a)}: {b:.3f}" if len(x) <= 300 else "" for a, b in pairs]
         parts += panel.stems(x, y, colour, titles)
         ring = f'fill="none" stroke="{ORANGE}" stroke-width="1.4"'
-        parts += [circle(*panel.place(a, b), 5, ring) for a, b in pairs if int(a) in marked]
+        parts += [circle(*panel.place(x[k], y[k]), 5, ring) for k in np.flatnonzero(ringed)]
     whole = 8.0 + len(panels) * (height + 12.0) + 26.0
     return figure(whole, parts, label)
 
@@ -292,7 +318,7 @@ def error_map(
                 f'stroke-width="0.6"><title>{mean:.3f} mm</title></polygon>'
             )
     parts = [*panel.axes("lateral (mm)", "depth (mm)"), *cells]
-    for a, b in seen[:400]:
+    for a, b in seen[:: -(-len(seen) // MOST_PLACES) or 1]:
         if x[0] <= a <= x[1] and y[0] <= b <= y[1]:
             dot = 'fill="#fff" stroke="#000" stroke-width="0.6"'
             parts.append(circle(*panel.place(float(a), float(b)), 1.7, dot))
