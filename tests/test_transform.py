@@ -15,6 +15,7 @@ from contextlib import suppress
 from dataclasses import replace
 
 import h5py
+import jaxtyping
 import numpy as np
 import pytest
 
@@ -134,6 +135,12 @@ def test_wrong_frames_are_not_handed_on(saved, tmp_path, capsys):
     assert "must not be used" in capsys.readouterr().err
 
 
+@pytest.fixture
+def unchecked(monkeypatch):
+    """As users call it, who may give a pair of numbers for an array."""
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -151,11 +158,13 @@ def test_wrong_frames_are_not_handed_on(saved, tmp_path, capsys):
         ({"image_covariance": np.eye(5)}, r"must have shape \(6, 6\)"),
     ],
 )
+@pytest.mark.usefixtures("unchecked")
 def test_transforms_that_cannot_be(change, message):
     with pytest.raises(InputError, match=message):
         replace(random_transform(), **change)
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_a_pair_of_sizes_will_do_and_a_failed_one_is_not_written(tmp_path):
     made = ImageTransform(np.eye(4), (0.1, 0.2))
     assert made.plus_matrix()[2, 1] == 0.2

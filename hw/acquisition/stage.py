@@ -173,7 +173,7 @@ class ProbeStage:
         place = pixel_of(expected, image.spacing_mm, image.array.shape[1])
         return place, _NEAR_MM / max(image.spacing_mm)
 
-    def locate(self, row: int) -> tuple[Float[np.ndarray, 2], float]:
+    def locate(self, row: int) -> tuple[Float[np.ndarray, " 2"], float]:
         """[lateral, range] (mm) of the target in a frame where the probe stands, and its contrast.
 
         Size and pixels are those of the same frame: the machine's depth may be changed any time.

@@ -96,7 +96,7 @@ class Motion:
 
 def first_joints(
     model: ArmModel, raw: tuple[float, ...], tcp_offset: tuple[float, ...]
-) -> Float[np.ndarray, 6]:
+) -> Float[np.ndarray, " 6"]:
     """Joints of an arm at its first pose: elbow up where possible, far from singularities.
 
     Raises:
@@ -127,7 +127,7 @@ class JointTrack:
     joints: Float[np.ndarray, "n 6"]
     end: float
 
-    def at(self, place: float) -> Float[np.ndarray, 6]:
+    def at(self, place: float) -> Float[np.ndarray, " 6"]:
         """Joints at a path parameter, rad."""
         k = int(np.searchsorted(self.places, place))
         if k == 0:
@@ -138,7 +138,7 @@ class JointTrack:
         part = (place - low) / (high - low)
         return (1 - part) * self.joints[k - 1] + part * self.joints[k]
 
-    def slope(self, place: float) -> Float[np.ndarray, 6]:
+    def slope(self, place: float) -> Float[np.ndarray, " 6"]:
         """Derivative of the joints by the path parameter at a place."""
         if len(self.places) < 2:
             return np.zeros(6)
@@ -158,7 +158,7 @@ class JointTrack:
 
 
 def track(
-    model: ArmModel, motion: Motion, tcp_offset: tuple[float, ...], start: Float[np.ndarray, 6]
+    model: ArmModel, motion: Motion, tcp_offset: tuple[float, ...], start: Float[np.ndarray, " 6"]
 ) -> JointTrack:
     """Joints along a motion that begins at given joints."""
     travel, turn = np.array(motion.travel), np.array(motion.turn)

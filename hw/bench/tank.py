@@ -153,7 +153,7 @@ class Tank:
     """
 
     image_to_probe: Float[np.ndarray, "4 4"]
-    point_mm: Float[np.ndarray, 3]
+    point_mm: Float[np.ndarray, " 3"]
     scene: Scene
     probe: LinearProbe = L14_5
     sound_speed_m_s: float = 1490.0
@@ -163,11 +163,11 @@ class Tank:
     noise: Noise = field(default_factory=Noise)
     seed: int = 0
 
-    def target(self, pose: Pose) -> Float[np.ndarray, 3]:
+    def target(self, pose: Pose) -> Float[np.ndarray, " 3"]:
         """The target in the image frame: q = X^-1 B^-1 c, mm."""
         return self.target_of(pose, self.point_mm)
 
-    def target_of(self, pose: Pose, point_mm: Float[np.ndarray, 3]) -> Float[np.ndarray, 3]:
+    def target_of(self, pose: Pose, point_mm: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
         """Any point of the base frame in the image frame, mm."""
         x = self.image_to_probe
         in_tool = (point_mm - pose[:3, 3]) @ pose[:3, :3]

@@ -84,7 +84,7 @@ class Sample:
     t: float
     offset_mm: float
     peak: float
-    translation: Float[np.ndarray, 3]
+    translation: Float[np.ndarray, " 3"]
 
 
 def acquire_by_injection(

@@ -132,7 +132,7 @@ def image_scan(
 
 
 def pixel_of(
-    place_mm: Float[np.ndarray, 2], spacing_mm: tuple[float, float], columns: int
+    place_mm: Float[np.ndarray, " 2"], spacing_mm: tuple[float, float], columns: int
 ) -> tuple[float, float]:
     """[u, v] of [lateral, range]: lateral counts from the middle column, range from row 0."""
     return (
@@ -142,7 +142,7 @@ def pixel_of(
 
 
 def place_of(
-    pixel: Float[np.ndarray, 2], spacing_mm: tuple[float, float], columns: int
-) -> Float[np.ndarray, 2]:
+    pixel: Float[np.ndarray, " 2"], spacing_mm: tuple[float, float], columns: int
+) -> Float[np.ndarray, " 2"]:
     """[lateral, range] of [u, v], mm; the inverse of :func:`pixel_of`."""
     return np.array([(pixel[0] - 0.5 * (columns - 1)) * spacing_mm[0], pixel[1] * spacing_mm[1]])

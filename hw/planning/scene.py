@@ -20,20 +20,20 @@ class Scene:
     """
 
     image_to_probe: Float[np.ndarray, "4 4"]
-    point_mm: Float[np.ndarray, 3]
-    looking: Float[np.ndarray, 3]
+    point_mm: Float[np.ndarray, " 3"]
+    looking: Float[np.ndarray, " 3"]
 
     @property
-    def tip_mm(self) -> Float[np.ndarray, 3]:
+    def tip_mm(self) -> Float[np.ndarray, " 3"]:
         """The middle of the probe's face in the tool centre point's frame, mm."""
         return self.image_to_probe[:3, 3]
 
     @property
-    def elevational(self) -> Float[np.ndarray, 3]:
+    def elevational(self) -> Float[np.ndarray, " 3"]:
         """Unit vector of the image's elevational axis in the tool centre point's frame."""
         return self.image_to_probe[:3, 1]
 
-    def expected(self, pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, 3]:
+    def expected(self, pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, " 3"]:
         """Where the target should be in the image of a probe at ``pose``, by this scene, mm.
 
         The negative of the elevational coordinate is the probe's place along a free-hand sweep.

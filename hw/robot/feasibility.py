@@ -68,12 +68,12 @@ class Arm:
 
     model: ArmModel
     tcp_offset: tuple[float, ...]
-    joint_min: Float[np.ndarray, 6]
-    joint_max: Float[np.ndarray, 6]
+    joint_min: Float[np.ndarray, " 6"]
+    joint_max: Float[np.ndarray, " 6"]
     least_dexterity_mm: float
     joint_speed: float
-    box_min_mm: Float[np.ndarray, 3]
-    box_max_mm: Float[np.ndarray, 3]
+    box_min_mm: Float[np.ndarray, " 3"]
+    box_max_mm: Float[np.ndarray, " 3"]
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ class Course:
         )
 
 
-def check_model(arm: Arm, pose: Float[np.ndarray, "4 4"], joints: Float[np.ndarray, 6]) -> None:
+def check_model(arm: Arm, pose: Float[np.ndarray, "4 4"], joints: Float[np.ndarray, " 6"]) -> None:
     """Whether the controller's joints and TCP pose fit the arm's model and TCP offset.
 
     Raises:
@@ -126,7 +126,7 @@ def follow(
     arm: Arm,
     start: Float[np.ndarray, "4 4"],
     goal: Float[np.ndarray, "4 4"],
-    joints: Float[np.ndarray, 6],
+    joints: Float[np.ndarray, " 6"],
     what: str,
     duration_s: float | None = None,
 ) -> Course:
@@ -194,7 +194,7 @@ def follow_all(
     arm: Arm,
     poses: Float[np.ndarray, "n 4 4"],
     durations_s: Float[np.ndarray, " m"],
-    joints: Float[np.ndarray, 6] | None = None,
+    joints: Float[np.ndarray, " 6"] | None = None,
 ) -> Course:
     """The arm along a plan, from pose to pose.
 
@@ -241,8 +241,8 @@ def _follow_branch(
     arm: Arm,
     poses: Float[np.ndarray, "n 4 4"],
     durations_s: Float[np.ndarray, " m"],
-    first: Float[np.ndarray, 6],
-    reference: Float[np.ndarray, 6],
+    first: Float[np.ndarray, " 6"],
+    reference: Float[np.ndarray, " 6"],
 ) -> tuple[int, Course | RefusedError]:
     """Index of the last pose tried in a branch, and the course or why it ends there."""
     stage = 0
@@ -275,7 +275,7 @@ def _joints_along(
     arm: Arm,
     way: Float[np.ndarray, "n 4 4"],
     branch: int,
-    joints: Float[np.ndarray, 6],
+    joints: Float[np.ndarray, " 6"],
     what: str,
     parts: Float[np.ndarray, " n"],
 ) -> Float[np.ndarray, "n 6"]:

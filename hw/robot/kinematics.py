@@ -80,12 +80,12 @@ class ArmModel:
     joint_speed_deg_s: float = 180.0
 
     @cached_property
-    def a(self) -> Float[np.ndarray, 6]:
+    def a(self) -> Float[np.ndarray, " 6"]:
         """DH lengths a_1 ... a_6."""
         return np.array([0.0, self.a2, self.a3, 0.0, 0.0, 0.0])
 
     @cached_property
-    def d(self) -> Float[np.ndarray, 6]:
+    def d(self) -> Float[np.ndarray, " 6"]:
         """DH offsets d_1 ... d_6."""
         return np.array([self.d1, 0.0, 0.0, self.d4, self.d5, self.d6])
 
@@ -96,7 +96,7 @@ class ArmModel:
         return math.hypot(planar, self.d4) + self.d6
 
     @cached_property
-    def levers_mm(self) -> Float[np.ndarray, 6]:
+    def levers_mm(self) -> Float[np.ndarray, " 6"]:
         """Bound of the flange's distance from a point on each joint's axis, in every pose."""
         wrist_2 = math.hypot(self.d5, self.d6)
         wrist_1 = self.d4 + wrist_2
@@ -242,7 +242,7 @@ def dexterity_mm(model: ArmModel, joints: Float[np.ndarray, "*n 6"]) -> Float[np
     return np.asarray(np.linalg.svd(scaled_jacobian(model, joints), compute_uv=False)[..., -1])
 
 
-def nearest_singularity(model: ArmModel, joints: Float[np.ndarray, 6]) -> str:
+def nearest_singularity(model: ArmModel, joints: Float[np.ndarray, " 6"]) -> str:
     """Which singularity is nearest, as words for a person."""
     frames = link_frames(model, joints)
     wrist = frames[5, :3, 3]
@@ -370,8 +370,8 @@ def branch_of(model: ArmModel, joints: Float[np.ndarray, "*n 6"]) -> Int[np.ndar
 
 
 def nearest(
-    model: ArmModel, flange: Float[np.ndarray, "4 4"], reference: Float[np.ndarray, 6]
-) -> Float[np.ndarray, 6] | None:
+    model: ArmModel, flange: Float[np.ndarray, "4 4"], reference: Float[np.ndarray, " 6"]
+) -> Float[np.ndarray, " 6"] | None:
     """The joints nearest to a reference that bring the flange to a pose; None where none do.
 
     In a wrist singularity joint 6 keeps its reference.

@@ -62,7 +62,7 @@ def turn_deg(first: Float[np.ndarray, "4 4"], second: Float[np.ndarray, "4 4"]) 
     return float(np.degrees(rotation_angle(first, second)))
 
 
-def looking_rotation(looking: Float[np.ndarray, 3]) -> Float[np.ndarray, "3 3"]:
+def looking_rotation(looking: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
     """Image axes [lateral, elevational, axial] in the base frame of a probe with this direction."""
     axial = np.asarray(looking, float) / np.linalg.norm(looking)
     guess = np.eye(3)[np.argmin(np.abs(axial))]

@@ -68,7 +68,7 @@ def towards(direction: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]
 
 def ellipsoid(
     covariance: Float[np.ndarray, "3 3"],
-) -> tuple[Float[np.ndarray, 3], Float[np.ndarray, "3 3"], int]:
+) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, "3 3"], int]:
     """Half axes (mm) of the 95 % ellipsoid as drawn, its axes, and how much larger it is drawn."""
     variances, axes = np.linalg.eigh(0.5 * (covariance + covariance.T))
     half = np.sqrt(_CHI_95 * np.maximum(variances, 0.0))
@@ -282,7 +282,7 @@ class Page:
 
     def _joints_for(
         self, arm: ArmModel, flange: Float[np.ndarray, "4 4"]
-    ) -> Float[np.ndarray, 6] | None:
+    ) -> Float[np.ndarray, " 6"] | None:
         """Joints near the last ones drawn; at first those that keep the arm highest."""
         if self._joints is not None:
             found = nearest(arm, flange, self._joints)

@@ -115,7 +115,7 @@ class Bootstrap(eqx.Module):
 
     image_to_probe: Float[AnyArray, "k 4 4"]
     converged: Float[AnyArray, " k"]
-    spread: Float[AnyArray, 6]
+    spread: Float[AnyArray, " 6"]
     reproducibility: Float[AnyArray, " m"]
     image_points: Float[AnyArray, "m 2"]
 

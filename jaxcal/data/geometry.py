@@ -26,7 +26,7 @@ def matrix_from_rotation(
     return jnp.concatenate([top, jnp.broadcast_to(row, (*top.shape[:-2], 1, 4))], axis=-2)
 
 
-def rotation_from_vector(vector: Float[Array, 3]) -> Float[Array, "3 3"]:
+def rotation_from_vector(vector: Float[Array, " 3"]) -> Float[Array, "3 3"]:
     """Rotation matrix of an axis times an angle (rad), by Rodrigues' formula.
 
     Derivatives of every order that the solvers take are accurate everywhere, zero included.

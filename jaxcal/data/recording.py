@@ -75,7 +75,7 @@ class Images:
     max_elevation: Float[np.ndarray, " n"] | None = None
     amplitude: Float[np.ndarray, " n"] | None = None
     time: Float[np.ndarray, " n"] | None = None
-    spacing_mm: Float[np.ndarray, 2] | None = None
+    spacing_mm: Float[np.ndarray, " 2"] | None = None
     face_offset_mm: float = 0.0
     time_of_flight: Float[np.ndarray, "n elements"] | None = None
     frame: Int[np.ndarray, " n"] | None = None
@@ -103,7 +103,7 @@ class Truth:
     """
 
     image_to_probe: Float[np.ndarray, "4 4"]
-    point: Float[np.ndarray, 3]
+    point: Float[np.ndarray, " 3"]
     elevation: Float[np.ndarray, " n"]
 
 
@@ -373,7 +373,7 @@ def check_kind(kind: object) -> None:
         raise InputError(f"kind must be one of {', '.join(get_args(Kind))}, not {shown(kind)}")
 
 
-def check_spacing(spacing_mm: Any, kind: Kind) -> Float[np.ndarray, 2] | None:
+def check_spacing(spacing_mm: Any, kind: Kind) -> Float[np.ndarray, " 2"] | None:
     """[lateral, axial] mm/px as an array; only pixels have it."""
     if spacing_mm is None:
         return None
@@ -524,7 +524,7 @@ def _check_units(images: Images) -> None:
     check_pose_units(translations, extent)
 
 
-def check_spacing_unit(spacing_mm: Float[np.ndarray, 2]) -> None:
+def check_spacing_unit(spacing_mm: Float[np.ndarray, " 2"]) -> None:
     """Refuse a pixel's size [lateral, axial] that cannot be in millimetres.
 
     Raises:

@@ -179,7 +179,7 @@ class Constraints:
             raise InputError(f"allowed must be a function of poses, not {self.allowed!r}")
 
     @property
-    def extent(self) -> Float[np.ndarray, 5]:
+    def extent(self) -> Float[np.ndarray, " 5"]:
         """Largest magnitude of each of the five numbers."""
         cone, turn = np.radians([self.cone_deg, self.turn_deg])
         return np.array([1.0, 1.0, cone, cone, turn])
@@ -188,7 +188,7 @@ class Constraints:
         self,
         poses: Float[np.ndarray, "n 4 4"],
         image_to_probe: Float[np.ndarray, "4 4"],
-        point: Float[np.ndarray, 3],
+        point: Float[np.ndarray, " 3"],
     ) -> Bool[np.ndarray, " n"]:
         """Which poses satisfy all constraints.
 
@@ -216,7 +216,7 @@ class Constraints:
         self,
         numbers: Float[np.ndarray, "n 5"],
         image_to_probe: Float[np.ndarray, "4 4"],
-        point: Float[np.ndarray, 3],
+        point: Float[np.ndarray, " 3"],
     ) -> Float[np.ndarray, "n 4 4"]:
         """Poses probe -> tracker (mm) from their five numbers."""
         tilt, turn = np.zeros((len(numbers), 3)), np.zeros((len(numbers), 3))
@@ -232,7 +232,7 @@ class Constraints:
         self,
         poses: Float[np.ndarray, "n 4 4"],
         image_to_probe: Float[np.ndarray, "4 4"],
-        point: Float[np.ndarray, 3],
+        point: Float[np.ndarray, " 3"],
     ) -> Float[np.ndarray, "n 5"]:
         """The five numbers of poses; the elevational offset is not among them and is ignored."""
         image = poses[:, :3, :3] @ image_to_probe[:3, :3]

@@ -110,7 +110,7 @@ class Search:
         return np.asarray(total) / len(self.rows)
 
     def alike(
-        self, rotation: Float[np.ndarray, " 9"], place: Float[np.ndarray, 3]
+        self, rotation: Float[np.ndarray, " 9"], place: Float[np.ndarray, " 3"]
     ) -> Bool[np.ndarray, " m"]:
         """Which candidates are replicates of a pose."""
         return are_alike(self.rotations, self.places, rotation[None], place[None], self.rules)[:, 0]

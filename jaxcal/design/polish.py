@@ -81,7 +81,9 @@ def _scored(
     return jax.value_and_grad(score)(numbers)
 
 
-def _cut_off(numbers: Float[np.ndarray, 5], extent: Float[np.ndarray, 5]) -> Float[np.ndarray, 5]:
+def _cut_off(
+    numbers: Float[np.ndarray, " 5"], extent: Float[np.ndarray, " 5"]
+) -> Float[np.ndarray, " 5"]:
     """The nearest numbers inside region, cone and turn."""
     tilt, cone = float(np.hypot(*numbers[2:4])), extent[2]
     inside = np.clip(numbers, -extent, extent)

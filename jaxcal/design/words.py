@@ -27,7 +27,7 @@ def pose_in_words(
     pose: Float[np.ndarray, "4 4"],
     constraints: Constraints,
     image_to_probe: Float[np.ndarray, "4 4"],
-    point: Float[np.ndarray, 3],
+    point: Float[np.ndarray, " 3"],
 ) -> str:
     """How to hold the probe, from the middle orientation, and where the target should be.
 

@@ -59,7 +59,7 @@ class Comparison:
 def compare_calibrations(
     first: Calibration | ImageTransform,
     second: Calibration | ImageTransform,
-    points: Float[np.ndarray, "m 2"] | Float[np.ndarray, 2],
+    points: Float[np.ndarray, "m 2"] | Float[np.ndarray, " 2"],
 ) -> Comparison:
     """Map the same image points by two calibrations of one probe, and compare.
 

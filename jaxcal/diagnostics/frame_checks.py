@@ -133,7 +133,7 @@ class _Fit:
     """
 
     reduced: ReducedObjective
-    x: Float[np.ndarray, 6]
+    x: Float[np.ndarray, " 6"]
 
     @property
     def squares(self) -> float:
@@ -141,7 +141,7 @@ class _Fit:
         return max(float(self.reduced(self.x)), self.reduced.resolution)
 
     @property
-    def scales(self) -> Float[np.ndarray, 2]:
+    def scales(self) -> Float[np.ndarray, " 2"]:
         """Factors on the points' two axes."""
         return np.linalg.norm(self.x.reshape(2, 3), axis=1)
 
@@ -166,7 +166,7 @@ def _far_better(before: float, after: float, count: int) -> bool:
     return bool(before > FACTOR * after and gained > np.log(ODDS))
 
 
-def _credible(scales: Float[np.ndarray, 2], images: ImageData, known: bool) -> bool:
+def _credible(scales: Float[np.ndarray, " 2"], images: ImageData, known: bool) -> bool:
     """Whether a slip's scales could be those of the image."""
     if known:
         return bool((np.abs(np.log(scales)) < np.log(SAME_SCALE)).all())

@@ -63,7 +63,9 @@ def static_transform_command(
 
 
 def range_note(
-    range_factor: float, face_offset_mm: float, scale_mm_per_px: Float[np.ndarray, 2] | None = None
+    range_factor: float,
+    face_offset_mm: float,
+    scale_mm_per_px: Float[np.ndarray, " 2"] | None = None,
 ) -> str | None:
     """What a rigid transform leaves to its user, in words; None where z is the measured range.
 

@@ -122,13 +122,13 @@ def _markups(positions: list[np.ndarray], labels: list[str], total: int) -> Mark
     return Markups(np.reshape(positions, (-1, 3)), tuple(labels), total - len(positions))
 
 
-def _signs(system: object) -> Float[np.ndarray, 3]:
+def _signs(system: object) -> Float[np.ndarray, " 3"]:
     if system not in ("LPS", "RAS"):
         raise FormatError(f"coordinate system {quoted(str(system))} is neither LPS nor RAS")
     return np.array([-1.0, -1.0, 1.0] if system == "LPS" else [1.0, 1.0, 1.0])
 
 
-def _three(value: object, what: str) -> Float[np.ndarray, 3]:
+def _three(value: object, what: str) -> Float[np.ndarray, " 3"]:
     numbers = value if isinstance(value, list) else []
     real = [float(part) for part in numbers if isinstance(part, int | float)]
     if len(numbers) != 3 or len(real) != 3 or not all(map(math.isfinite, real)):

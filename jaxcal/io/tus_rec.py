@@ -71,7 +71,7 @@ def read_scan(path: str | os.PathLike[str]) -> TrackedSequence:
 
 
 def calib_matrix(
-    image_to_probe: Float[np.ndarray, "4 4"], scale_mm_per_px: Float[np.ndarray, 2]
+    image_to_probe: Float[np.ndarray, "4 4"], scale_mm_per_px: Float[np.ndarray, " 2"]
 ) -> str:
     """``calib_matrix.csv`` of a calibration from pixels, which are counted from 1 there.
 
@@ -93,7 +93,7 @@ def _rows(matrix: np.ndarray) -> list[str]:
 
 def read_calib_matrix(
     path: str | os.PathLike[str],
-) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, 2]]:
+) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, " 2"]]:
     """What :func:`calib_matrix` was made from; the file is not trusted.
 
     Raises:

@@ -268,8 +268,8 @@ def _cayley(vector: Float[Array, "3 batch"]) -> Float[Array, "3 3 batch"]:
     return jnp.asarray(eye) + (2 / (1 + square)) * (cross + bent)
 
 
-def picked(array: Float[Array, "k ..."], indices: np.ndarray) -> Float[Array, "*indices ..."]:
-    """The entries at known indices of the first axis, in one operation."""
+def picked(array: Float[Array, "k ..."], indices: np.ndarray) -> Float[Array, " ..."]:
+    """The entries at known indices of the first axis, in one operation; the indices' axes first."""
     # Unsigned, because JAX adds the size to negative indices, in the integer type of whoever traced
     # that code first, which may have another number of bits.
     return array.at[indices.astype(np.uint32)].get(mode="promise_in_bounds")

@@ -43,9 +43,9 @@ class Parameters(eqx.Module):
     def of(
         cls,
         rotation: Float[Array, "3 3"],
-        translation: Float[Array, 3],
-        point: Float[Array, 3],
-        scale: Float[Array, 2] | None = None,
+        translation: Float[Array, " 3"],
+        point: Float[Array, " 3"],
+        scale: Float[Array, " 2"] | None = None,
     ) -> Parameters:
         """X and the target, with nominal scale, sound speed and delay."""
         one = jnp.ones((), translation.dtype)

@@ -84,7 +84,7 @@ class ImageTransform:
     """
 
     image_plane_to_probe: Float[np.ndarray, "4 4"]
-    scale_mm_per_px: Float[np.ndarray, 2] | None = None
+    scale_mm_per_px: Float[np.ndarray, " 2"] | None = None
     face_offset_mm: float = 0.0
     covariance: Float[np.ndarray, "6 6"] | None = None
     error_mm: float | None = None
@@ -287,7 +287,7 @@ class ImageTransform:
         jacobian = point_jacobian(plane[:, [0, 2]], blocks, self.face_offset_mm, self.range_factor)
         return self.image_plane_to_probe[:3, :3] @ jacobian @ root
 
-    def _mm_per_px(self) -> Float[np.ndarray, 2]:
+    def _mm_per_px(self) -> Float[np.ndarray, " 2"]:
         """Size of a pixel at the estimated sound speed; 1 across where points are in mm."""
         scale = np.ones(2) if self.scale_mm_per_px is None else self.scale_mm_per_px
         return scale * np.array([1.0, self.range_factor])
@@ -305,7 +305,7 @@ class ImageTransform:
         plane[:, [0, 2]] = self._mm_per_px() * measured + np.array([0.0, self.face_offset_mm])
         return plane
 
-    def _scale(self) -> Float[np.ndarray, 2]:
+    def _scale(self) -> Float[np.ndarray, " 2"]:
         if self.scale_mm_per_px is None:
             raise InputError(
                 f"{self.source}: no pixel size is known, so there is no Image frame in pixels: "

@@ -216,7 +216,7 @@ def stands_out(studentised: Float[Array, "n 3"], keep: Float[Array, " n"]) -> Fl
 
 def _robust(
     errors: Float[Array, "n 3"], weight: Float[Array, " n"], model: ConsensusModel
-) -> Float[Array, 3]:
+) -> Float[Array, " 3"]:
     """SDs of the components from the median magnitudes of the weighted images, mm."""
     # The unknowns' degrees of freedom are shared equally by the three components.
     freedom = jnp.maximum(1 - count_unknowns(model.blocks) / (3 * jnp.sum(weight)), 0.1)
@@ -228,7 +228,7 @@ def _efficient(
     leverage: Float[Array, "n 3"],
     weight: Float[Array, " n"],
     model: ConsensusModel,
-) -> tuple[Float[Array, 3], Float[Array, 3]]:
+) -> tuple[Float[Array, " 3"], Float[Array, " 3"]]:
     """SDs of the components from mean squares of the weighted images, mm; degrees of freedom.
 
     A median of few images is itself uncertain; without gross errors these SDs are twice as certain.
@@ -244,7 +244,7 @@ def _efficient(
 def _studentise(
     errors: Float[Array, "n 3"],
     leverage: Float[Array, "n 3"],
-    sigma: Float[Array, 3],
+    sigma: Float[Array, " 3"],
     weight: Float[Array, " n"],
 ) -> Float[Array, "n 3"]:
     """Errors in SDs, corrected for leverage."""
@@ -268,7 +268,7 @@ def linearise(
 
 
 def _information(
-    jacobian: Float[Array, "p n 3"], sigma: Float[Array, 3], weight: Float[Array, " n"]
+    jacobian: Float[Array, "p n 3"], sigma: Float[Array, " 3"], weight: Float[Array, " n"]
 ) -> Float[Array, "p p"]:
     weighted = jnp.where(weight[:, None] > 0, jacobian / sigma**2, 0.0)
     return jnp.einsum("anm,bnm->ab", jnp.where(weight[:, None] > 0, jacobian, 0.0), weighted)
@@ -278,7 +278,7 @@ def _step(
     parameters: Parameters,
     errors: Float[Array, "n 3"],
     jacobian: Float[Array, "p n 3"],
-    sigma: Float[Array, 3],
+    sigma: Float[Array, " 3"],
     weight: Float[Array, " n"],
     model: ConsensusModel,
 ) -> Parameters:
@@ -293,7 +293,7 @@ def _step(
 
 
 def _leverage(
-    jacobian: Float[Array, "p n 3"], sigma: Float[Array, 3], weight: Float[Array, " n"]
+    jacobian: Float[Array, "p n 3"], sigma: Float[Array, " 3"], weight: Float[Array, " n"]
 ) -> Float[Array, "n 3"]:
     matrix = _information(jacobian, sigma, weight)
     inverse = dense.inverse_symmetric(matrix, jnp.diagonal(matrix))
@@ -303,7 +303,7 @@ def _leverage(
 
 def _medians(
     errors: Float[Array, "n 3"], weight: Float[Array, " n"], model: ConsensusModel
-) -> Float[Array, 3]:
+) -> Float[Array, " 3"]:
     """Median magnitude of each component over the weighted images, mm."""
     if model.isotropic:
         three = jnp.repeat(weight, 3)
@@ -334,6 +334,6 @@ def quantile(
     return jnp.where(jnp.sum(weight * (values <= high)) >= wanted, found, jnp.inf)
 
 
-def _with_floor(sigma: Float[Array, 3]) -> Float[Array, 3]:
+def _with_floor(sigma: Float[Array, " 3"]) -> Float[Array, " 3"]:
     """No SD below a fiftieth of the largest: smaller errors are no gross ones."""
     return jnp.maximum(sigma, jnp.maximum(RELATIVE_FLOOR * jnp.max(sigma), 1e-6))

@@ -64,13 +64,13 @@ def pairwise_gradient(start: Iterate, images: ImagePlanes, options: Options) -> 
     unit = jnp.concatenate([jnp.broadcast_to(lever, (3,)), jnp.ones(3, lever.dtype)])
     rest = jnp.zeros(start.unknowns - 6, lever.dtype)
 
-    def moved(tangent: Float[Array, 6]) -> Iterate:
+    def moved(tangent: Float[Array, " 6"]) -> Iterate:
         return start.moved(jnp.concatenate([unit * tangent, rest])[:, None])
 
     def target(iterate: Iterate) -> Float[Array, "3 batch"]:
         return jnp.sum(images.mask * reconstructed(iterate, images), axis=2) / count
 
-    def cost(tangent: Float[Array, 6], _: None) -> Float[Array, ""]:
+    def cost(tangent: Float[Array, " 6"], _: None) -> Float[Array, ""]:
         iterate = moved(tangent)
         away = reconstructed(iterate, images) - target(iterate)[..., None]
         # The mean over pairs in units of the lever arm: an objective of order one.

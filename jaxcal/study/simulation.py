@@ -148,7 +148,7 @@ class Experiment(eqx.Module):
     covariance: Float[Array, "n 2 2"]
     elevation: Float[Array, " n"]
     image_to_probe: Float[Array, "4 4"]
-    point: Float[Array, 3]
+    point: Float[Array, " 3"]
     test_poses: Float[Array, "m 4 4"]
     test_points: Float[Array, "m 2"]
     distances: Float[Array, "n elements"] | None = None

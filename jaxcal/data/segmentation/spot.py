@@ -305,7 +305,7 @@ def _steps(first: np.ndarray, extent: tuple[float, float]) -> np.ndarray:
     return np.array([extent[1], extent[0], 1.0] + components * [0.5, 0.3, 0.3, lean])
 
 
-def _width(unknowns: np.ndarray) -> Float[np.ndarray, 2]:
+def _width(unknowns: np.ndarray) -> Float[np.ndarray, " 2"]:
     """SDs along u and v of the brightest component of the fitted spot, px."""
     components = unknowns[3:].reshape(-1, 4)
     _, log_a, log_b, c = components[np.argmax(components[:, 0])]

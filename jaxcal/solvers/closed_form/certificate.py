@@ -37,9 +37,9 @@ ORTHONORMAL = 1e-6
 def certify(
     problem: Problem | Recording | Images,
     image_to_probe: Float[AnyArray, "4 4"],
-    point: Float[AnyArray, 3] | None = None,
+    point: Float[AnyArray, " 3"] | None = None,
     *,
-    scale_mm_per_px: Float[AnyArray, 2] | None = None,
+    scale_mm_per_px: Float[AnyArray, " 2"] | None = None,
     sound_speed_factor: float = 1.0,
     estimate: str | Sequence[str] = (),
 ) -> Certificate:

@@ -122,7 +122,7 @@ class ImageData:
     translations: Float[np.ndarray, "n 3"]
     points: Float[np.ndarray, "n 2"]
     face_offset: float
-    spacing: Float[np.ndarray, 2]
+    spacing: Float[np.ndarray, " 2"]
     pixels: bool
 
 
@@ -144,14 +144,14 @@ class ReducedObjective:
     """
 
     factor: Float[np.ndarray, "6 6"]
-    shift: Float[np.ndarray, 6]
+    shift: Float[np.ndarray, " 6"]
     rest: float
     resolution: float
     images: int
     origin_determined: bool
     origin_map: Float[np.ndarray, "3 7"]
     target_map: Float[np.ndarray, "3 10"]
-    mean: Float[np.ndarray, 2]
+    mean: Float[np.ndarray, " 2"]
     constraints: QuadraticConstraints
 
     def __call__(self, x: Float[np.ndarray, "*starts 6"]) -> Any:
@@ -159,8 +159,8 @@ class ReducedObjective:
         return np.sum((x @ self.factor.T + self.shift) ** 2, axis=-1) + self.rest
 
     def origin_and_target(
-        self, x: Float[np.ndarray, 6]
-    ) -> tuple[Float[np.ndarray, 3], Float[np.ndarray, 3]]:
+        self, x: Float[np.ndarray, " 6"]
+    ) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
         """The t and c that minimise Eq. 7 for x (those of least norm where several do), mm."""
         of_mean = self.origin_map @ np.append(x, 1.0)
         target = self.target_map @ np.concatenate([of_mean, x, [1.0]])
@@ -227,7 +227,7 @@ def used_images(
     poses: Float[np.ndarray, "n 4 4"],
     measurements: Float[np.ndarray, "n 2"],
     mask: Bool[np.ndarray, " n"],
-    spacing: Float[np.ndarray, 2],
+    spacing: Float[np.ndarray, " 2"],
     face_offset: float,
     pixels: bool,
 ) -> ImageData:
@@ -324,7 +324,7 @@ def tolerance(reduced: ReducedObjective, objective: float) -> float:
     return TOLERANCE * objective + reduced.resolution
 
 
-def multipliers(reduced: ReducedObjective, x: Float[np.ndarray, 6]) -> Float[np.ndarray, " k"]:
+def multipliers(reduced: ReducedObjective, x: Float[np.ndarray, " 6"]) -> Float[np.ndarray, " k"]:
     """The multipliers that make x most nearly stationary."""
     gradient = reduced.factor.T @ (reduced.factor @ x + reduced.shift)
     columns = (reduced.constraints.matrices @ x).T
@@ -332,7 +332,7 @@ def multipliers(reduced: ReducedObjective, x: Float[np.ndarray, 6]) -> Float[np.
 
 
 def duality_gap(
-    reduced: ReducedObjective, x: Float[np.ndarray, 6], values: Float[np.ndarray, " k"]
+    reduced: ReducedObjective, x: Float[np.ndarray, " 6"], values: Float[np.ndarray, " k"]
 ) -> float:
     """f(x) of a feasible x less the bound that multipliers prove; inf where M is indefinite."""
     added = np.tensordot(values, reduced.constraints.matrices, 1)
@@ -346,7 +346,7 @@ def duality_gap(
     return float(np.sum(np.linalg.solve(lower, stationary) ** 2))
 
 
-def unconstrained_gap(reduced: ReducedObjective, x: Float[np.ndarray, 6]) -> float:
+def unconstrained_gap(reduced: ReducedObjective, x: Float[np.ndarray, " 6"]) -> float:
     """f(x) less its minimum without any constraint; this bound holds for a singular C as well."""
     left, values, _ = np.linalg.svd(reduced.factor)
     within = left[:, values > SINGULAR * max(values[0], np.finfo(float).tiny)]
@@ -354,7 +354,7 @@ def unconstrained_gap(reduced: ReducedObjective, x: Float[np.ndarray, 6]) -> flo
 
 
 def gap_of_multipliers(
-    reduced: ReducedObjective, x: Float[np.ndarray, 6], values: Float[np.ndarray, " k"]
+    reduced: ReducedObjective, x: Float[np.ndarray, " 6"], values: Float[np.ndarray, " k"]
 ) -> float:
     """The smallest gap proved by multipliers near the given ones, mm^2.
 
@@ -380,7 +380,7 @@ def gap_of_multipliers(
 
 def certify_point(
     reduced: ReducedObjective,
-    x: Float[np.ndarray, 6],
+    x: Float[np.ndarray, " 6"],
     *,
     excess: float = 0.0,
     values: Float[np.ndarray, " k"] | None = None,
@@ -417,7 +417,7 @@ def certify_point(
 
 def _is_unique(
     reduced: ReducedObjective,
-    x: Float[np.ndarray, 6],
+    x: Float[np.ndarray, " 6"],
     values: Float[np.ndarray, " k"],
     excess: float,
 ) -> bool:

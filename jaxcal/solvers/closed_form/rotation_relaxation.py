@@ -48,7 +48,7 @@ class Relaxation:
     """
 
     gap: float
-    x: Float[np.ndarray, 6]
+    x: Float[np.ndarray, " 6"]
 
 
 @cache
@@ -84,7 +84,7 @@ def _equations(scaled: bool) -> Float[np.ndarray, "m v v"]:
 
 
 def lower_bound(
-    reduced: ReducedObjective, x: Float[np.ndarray, 6], enough: float
+    reduced: ReducedObjective, x: Float[np.ndarray, " 6"], enough: float
 ) -> Relaxation | None:
     """Bound f from below.
 

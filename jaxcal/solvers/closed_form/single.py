@@ -173,7 +173,7 @@ def closed_form_start(problem: Problem, blocks: Blocks) -> Start:
     return assembled(Start, parts)
 
 
-def solve(reduced: ReducedObjective) -> tuple[Float[np.ndarray, 6], Certificate]:
+def solve(reduced: ReducedObjective) -> tuple[Float[np.ndarray, " 6"], Certificate]:
     """The minimiser (a1, a3) of a reduced objective and its certificate."""
     constraints = reduced.constraints
     both = constraints.free == ("lateral", "axial")
@@ -206,7 +206,7 @@ def solve(reduced: ReducedObjective) -> tuple[Float[np.ndarray, 6], Certificate]
 
 def scalar_root(
     reduced: ReducedObjective,
-) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, 6]] | None:
+) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " 6"]] | None:
     """Both scales unknown: the root of phi, by Newton's method kept within its bracket."""
     values = np.linalg.svd(reduced.factor, compute_uv=False)
     if values[-1] <= 1e-9 * values[0]:
@@ -233,7 +233,7 @@ def scalar_root(
 
 def _dual_maximum(
     reduced: ReducedObjective,
-) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, 6]] | None:
+) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " 6"]] | None:
     """Newton's method on the concave dual; None where C is singular and no scale is known."""
     constraints = reduced.constraints
     size = float(np.linalg.norm(reduced.factor, 2))
@@ -282,7 +282,7 @@ def _dual_maximum(
     return values * size**2, state[2]
 
 
-def _sphere_multiplier(squared: Float[np.ndarray, "6 6"], rhs: Float[np.ndarray, 6]) -> float:
+def _sphere_multiplier(squared: Float[np.ndarray, "6 6"], rhs: Float[np.ndarray, " 6"]) -> float:
     """The l with |(Q + l I)^-1 b|^2 = 2, or the least one with Q + l I positive definite."""
     w, v = np.linalg.eigh(squared)
     along = np.abs(v.T @ rhs)
@@ -302,7 +302,9 @@ def _sphere_multiplier(squared: Float[np.ndarray, "6 6"], rhs: Float[np.ndarray,
     return max(edge, at)
 
 
-def feasible(x: Float[np.ndarray, 6], constraints: QuadraticConstraints) -> Float[np.ndarray, 6]:
+def feasible(
+    x: Float[np.ndarray, " 6"], constraints: QuadraticConstraints
+) -> Float[np.ndarray, " 6"]:
     """A point near x that satisfies the constraints: the nearest orthonormal pair, scaled."""
     pair = x.reshape(2, 3).T
     lengths = np.linalg.norm(pair, axis=0)
@@ -371,7 +373,7 @@ def _starts(reduced: ReducedObjective) -> Float[np.ndarray, "60 6"]:
 
 # On a degenerate problem a step may overflow; its value is then NaN or Inf, and it is not taken.
 @np.errstate(over="ignore", divide="ignore", invalid="ignore")
-def descend(reduced: ReducedObjective, x: Float[np.ndarray, "s 6"]) -> Float[np.ndarray, 6]:
+def descend(reduced: ReducedObjective, x: Float[np.ndarray, "s 6"]) -> Float[np.ndarray, " 6"]:
     """The best of Newton's descents on rotation and free scales from several feasible points.
 
     The Hessian's eigenvalues are taken by magnitude and damped, so that saddles repel.
@@ -449,7 +451,7 @@ def _moved(
 
 
 def _assemble(
-    x: Float[np.ndarray, 6], certificate: Certificate, reduced: ReducedObjective, data: ImageData
+    x: Float[np.ndarray, " 6"], certificate: Certificate, reduced: ReducedObjective, data: ImageData
 ) -> ClosedForm:
     """The calibration that a minimiser (a1, a3) stands for."""
     origin, point = reduced.origin_and_target(x)
