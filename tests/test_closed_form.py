@@ -350,7 +350,7 @@ def test_what_cannot_be_asked_for():
     pixels = jaxcal.make_images(points.poses, points.measurements, "pixel")
     with pytest.raises(jaxcal.InputError, match="no spacing_mm"):
         jaxcal.calibrate_closed_form(pixels)
-    with pytest.raises(jaxcal.InputError, match=r"problem 1 differs .* in its number of images"):
+    with pytest.raises(jaxcal.InputError, match="problem 1 has 5 images, problem 0 has 6"):
         jaxcal.calibrate_closed_form([points, drawn(0, 5)])
     few = dataclasses.replace(points, mask=np.arange(6) < 3)
     with pytest.raises(jaxcal.InputError, match="3 used images are too few"):
