@@ -115,7 +115,8 @@ def plot(path: Path, rows: list[list[object]]) -> None:
     upper, lower = figure.subplots(2, 1)
     names = [f"{row[0]}\nn = {row[1]}\n{row[2]:g}, {row[3]:g} mm" for row in rows]
     for axis in AXES:
-        upper.plot(column[f"cover_{axis}"], "o", label=axis, markersize=4)
+        kind = {"t": "translation", "r": "rotation"}[axis[0]]
+        upper.plot(column[f"cover_{axis}"], "o", label=f"{kind}, {axis[2:]}", markersize=4)
     for k, row in enumerate(rows):
         upper.fill_between([k - 0.5, k + 0.5], *ASKED[int(str(row[1]))], color="0.9")
     upper.axhline(0.95, color="black", linewidth=0.8)
@@ -124,9 +125,12 @@ def plot(path: Path, rows: list[list[object]]) -> None:
     lower.plot(column["predicted_over_actual"], "o")
     lower.axhspan(1 - TRE_WITHIN, 1 + TRE_WITHIN, color="0.9")
     lower.axhline(1, color="black", linewidth=0.8)
-    lower.set(ylabel="predicted over actual TRE", ylim=(0.7, 1.3))
+    lower.set(
+        ylabel="predicted over actual TRE",
+        xlabel="distribution of the offsets; images; size of offsets, noise",
+    )
     for panel in (upper, lower):
-        panel.set_xticks(range(len(rows)), names, fontsize=6)
+        panel.set_xticks(range(len(rows)), names, fontsize=7)
     save_figure(figure, path, dpi=130)
 
 

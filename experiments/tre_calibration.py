@@ -236,7 +236,7 @@ def plot(path: Path, by_law: list[list[object]], by_scale: list[list[object]]) -
     """Shares held, and predicted over actual with and without the further unknowns."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(12, 4.5), layout="constrained")
+    figure = Figure(figsize=(12, 6), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1, 2.2))
     spots = np.arange(len(by_law))
     left.axhspan(*HELD, color="0.9")
@@ -248,14 +248,14 @@ def plot(path: Path, by_law: list[list[object]], by_scale: list[list[object]]) -
         left.plot(spots + aside, shares, marker, color=colour, label=name.replace("_", " "))
     names = [f"{row[0]}, {row[2]:g} mm" for row in by_law]
     left.set_xticks(spots, names, rotation=90, fontsize=7)
-    left.set(ylabel="share of 95 % intervals that hold the TRE", ylim=(0.0, 1.02))
+    left.set(ylabel="95 % intervals with the actual TRE", ylim=(0.0, 1.02))
     left.legend(fontsize="small")
     spots = np.arange(len(by_scale))
     right.axhspan(*RATIO, color="0.9")
     right.axhline(1, color="black", linewidth=0.8)
     for name, label, marker, colour in (
         ("predicted_over_actual", "all unknowns", "o", "#0072B2"),
-        ("before_over_actual", "before: covariance of X alone", "x", "#D55E00"),
+        ("before_over_actual", "covariance of X alone", "x", "#D55E00"),
     ):
         ratio = [row[SCALE_HEADER.index(name)] for row in by_scale]
         right.plot(spots, ratio, marker, color=colour, label=label)

@@ -228,14 +228,16 @@ def _linked(poses: Float[np.ndarray, "n 4 4"]) -> Int[np.ndarray, " n"]:
     order = np.lexsort((second_axis, strip))
     poses, strip, second_axis = poses[order], strip[order], second_axis[order]
     places = _places(poses).T
+    # One number for strip and place in it; strips are farther apart than poses that may be near.
     wide = np.ptp(second_axis) + 2 * limit
     line = strip * wide + second_axis
     pairs = np.zeros((2, 0), int)
-    for further in (0, 1):
+    for further in (0, 1):  # this strip, then the next one
         at = np.arange(count)
         other = np.searchsorted(line, line + wide - limit) if further else at + 1
         end = np.searchsorted(line, line + further * wide + limit)
         passed = _ends_of_runs(label)
+        # Every pose goes through its neighbours from ``other`` up to ``end``, all poses at once.
         while True:
             at, other, end = (each[other < end] for each in (at, other, end))
             if not len(at):
@@ -247,7 +249,7 @@ def _linked(poses: Float[np.ndarray, "n 4 4"]) -> Int[np.ndarray, " n"]:
             near = displacement(poses[first], poses[second]) <= SAME_POSE_MM
             pairs = np.concatenate([pairs, [first[near], second[near]]], axis=1)
             other = np.where(known, passed[other], other + 1)
-            if pairs.shape[1] > count // 8:
+            if pairs.shape[1] > count // 8:  # enough news to be worth the search for components
                 label, pairs = _components(count, *label[pairs])[label], pairs[:, :0]
                 passed = _ends_of_runs(label)
         label, pairs = _components(count, *label[pairs])[label], pairs[:, :0]
