@@ -121,7 +121,7 @@ def test_stacking_unlike_problems_says_in_what_they_differ():
     bare = jaxcal.Problem.from_arrays(np.asarray(one.poses), np.asarray(one.measurements))
     for other, message in (
         (shorter, f"problem 1 has 7 images, problem 0 has {one.images}: pad"),
-        (bare, "problem 1 and problem 0 do not hold the same: sound_speed, delay$"),
+        (bare, "problem 1 and problem 0 do not hold the same: sound_speed, delay; give"),
     ):
         with pytest.raises(jaxcal.InputError, match=message):
             jaxcal.stack([one, other])

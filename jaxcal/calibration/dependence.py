@@ -218,6 +218,7 @@ def _linked(poses: Float[np.ndarray, "n 4 4"]) -> Int[np.ndarray, " n"]:
     Every pose is compared with the later ones of its own strip and those of the next strip. Strips
     are of one coordinate and sorted by another; in them, poses that are known to be connected are
     passed over, so that a long hold takes no more time and memory than as many different poses.
+    (scipy's search tree would list all pairs of a hold: 125 million for 40 holds of 2,500 frames.)
     """
     count, limit = len(poses), 2 * SAME_POSE_MM
     label = np.arange(count)

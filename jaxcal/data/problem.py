@@ -303,11 +303,12 @@ def stack(problems: list[Problem]) -> Problem:
             unlike = [
                 name
                 for name, value in vars(problem).items()
-                if (value is None) != (getattr(first, name) is None)
+                if jax.tree.structure(value) != jax.tree.structure(getattr(first, name))
                 or (isinstance(value, bool) and value != getattr(first, name))
             ]
             raise InputError(
-                f"problem {index} and problem 0 do not hold the same: {', '.join(unlike)}"
+                f"problem {index} and problem 0 do not hold the same: {', '.join(unlike)}; give "
+                "these to both, or to neither"
             )
 
     def stacked(*leaves: Any) -> Any:

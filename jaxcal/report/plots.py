@@ -24,7 +24,7 @@ from jaxcal.model.image_points import mean_of_squares
 from jaxcal.report.accuracy import error_shares, region_of, scatter_shares
 from jaxcal.report.convergence import Curve
 from jaxcal.report.summary import recording_of
-from jaxcal.report.svg import MOST_DRAWN, bar_length, drawn
+from jaxcal.report.svg import bar_length, drawn, spread_out
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.given_values import real_array
@@ -86,7 +86,7 @@ def plot_tre(calibration: Calibration, factor: float = 1.0) -> Figure:
     axes.clabel(lines, fontsize=6, fmt="%.3g")
     poses = recording.calibration.poses[np.asarray(answer.mask) > 0]
     seen = targets_in_images(poses, answer.image_to_probe, answer.point)
-    seen = seen[:: -(-len(seen) // MOST_DRAWN) or 1]
+    seen = spread_out(seen)
     axes.plot(seen[:, 0], seen[:, 2], "o", ms=1.8, mfc="white", mec="black", mew=0.4)
     axes.set_aspect("equal")
     axes.invert_yaxis()

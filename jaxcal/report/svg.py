@@ -56,6 +56,11 @@ def drawn(values: Float[np.ndarray, " n"], marked: Int[np.ndarray, " m"]) -> Int
     return np.union1d(extremes(np.arange(len(values))), extremes(marked)).astype(int)
 
 
+def spread_out(places: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "m k"]:
+    """At most :data:`MOST_PLACES` of the places, evenly from the whole recording."""
+    return places[:: -(-len(places) // MOST_PLACES) or 1]
+
+
 def viridis(share: Number) -> str:
     """Colour of a number between 0 and 1."""
     place = min(max(share, 0.0), 1.0) * (len(_VIRIDIS) - 1)
@@ -318,7 +323,7 @@ def error_map(
                 f'stroke-width="0.6"><title>{mean:.3f} mm</title></polygon>'
             )
     parts = [*panel.axes("lateral (mm)", "depth (mm)"), *cells]
-    for a, b in seen[:: -(-len(seen) // MOST_PLACES) or 1]:
+    for a, b in spread_out(seen):
         if x[0] <= a <= x[1] and y[0] <= b <= y[1]:
             dot = 'fill="#fff" stroke="#000" stroke-width="0.6"'
             parts.append(circle(*panel.place(float(a), float(b)), 1.7, dot))
