@@ -96,6 +96,7 @@ def test_compiler_flags_change_rounding_only(monkeypatch):
 
 def test_stacking_compiles_nothing():
     problems = [drawn(k % 3) for k in range(7)]
+    problems[1] = select(problems[1], slice(7))
     jax.clear_caches()
     compiled = []
 
@@ -110,21 +111,36 @@ def test_stacking_compiles_nothing():
         jax.monitoring.unregister_event_duration_listener(listen)
     assert compiled == []
     np.testing.assert_array_equal(batch.poses[5], problems[2].poses)
+    np.testing.assert_array_equal(batch.poses[1, :7], problems[1].poses)
+    assert batch.mask[1].tolist() == [1.0] * 7 + [0.0] * (IMAGES - 7)
     assert batch.measurements.dtype == problems[0].measurements.dtype
 
 
 def test_stacking_unlike_problems_says_in_what_they_differ():
     one = drawn(0)
-    shorter = jaxcal.Problem.from_arrays(
-        np.asarray(one.poses)[:7], np.asarray(one.measurements)[:7]
-    )
     bare = jaxcal.Problem.from_arrays(np.asarray(one.poses), np.asarray(one.measurements))
-    for other, message in (
-        (shorter, f"problem 1 has 7 images, problem 0 has {one.images}: pad"),
-        (bare, "problem 1 and problem 0 do not hold the same: sound_speed, delay; give"),
-    ):
-        with pytest.raises(jaxcal.InputError, match=message):
-            jaxcal.stack([one, other])
+    with pytest.raises(jaxcal.InputError, match="do not hold the same: sound_speed, delay; give"):
+        jaxcal.stack([one, bare])
+
+
+def test_a_problem_of_fewer_images_has_its_own_answer():
+    longer, shorter = (drawn(k, elevation_mm=1.5, noise_mm=1.0) for k in range(2))
+    shorter = select(shorter, slice(8))
+    found = jaxcal.calibrate_batch([shorter, longer], "conventional").numpy()
+    assert found.images_used.tolist() == [8, IMAGES]
+    for each, one in zip((found[0], found[1]), (shorter, longer), strict=True):
+        alone = jaxcal.calibrate(one, "conventional").numpy()
+        for field in ("image_to_probe", "point", "covariance"):
+            np.testing.assert_allclose(
+                getattr(each, field), getattr(alone, field), rtol=1e-7, atol=1e-9
+            )
+        assert not each.elevation[one.images :].any()
+
+
+def test_problems_of_unlike_lengths_are_stacked_inside_transformations():
+    problems = [drawn(0), select(drawn(1), slice(7))]
+    traced = jax.eval_shape(lambda *each: jaxcal.stack(list(each)), *problems)
+    assert traced.poses.shape == jaxcal.stack(problems).poses.shape == (2, IMAGES, 4, 4)
 
 
 @pytest.mark.slow

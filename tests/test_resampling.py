@@ -83,6 +83,13 @@ def test_a_bad_image_has_the_most_influence(data):
     assert float(found.influence[4]) > 3 * float(np.median(found.influence))
 
 
+def test_many_images_are_held_out_several_at_a_time(data, whole, monkeypatch):
+    monkeypatch.setattr(resampling, "MOST_FOLDS", COUNT - 1)
+    found = cross_validate(data, result=whole, **CONVENTIONAL)
+    assert found.converged.all() and found.converged.shape == (COUNT - 1,)
+    np.testing.assert_array_equal(found.moved[0], found.moved[COUNT - 1])
+
+
 def test_a_calibration_by_another_method_is_refused(data, whole):
     """Compared with the folds, it would be taken for the influence of the images.
 

@@ -257,7 +257,8 @@ def calibrate_batch(
 
     Args:
         problems: leading axes of any shape; see :func:`jaxcal.stack`. A list of problems,
-            recordings or sets of images is stacked; all must have the same number of images.
+            recordings or sets of images is stacked, those with fewer images after masked ones were
+            added to them.
         method: as for :func:`calibrate`.
         prior: as for :func:`calibrate`.
         max_elevation: as for :func:`calibrate`.

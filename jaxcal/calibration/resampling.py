@@ -51,6 +51,8 @@ T = TypeVar("T")
 
 LARGEST_RESAMPLES = 100_000
 """Most resamples of a bootstrap."""
+MOST_FOLDS = 100
+"""With more images than this, cross-validation holds out several at a time by default."""
 MOST_TOGETHER = 200_000
 """Most images, over all calibrations, that are solved in one batch: about 1 GiB."""
 
@@ -132,7 +134,8 @@ def cross_validate(
 
     Args:
         problem: one problem, a recording, or one set of images.
-        folds: image i belongs to fold i mod folds; by default every image is a fold of its own.
+        folds: image i belongs to fold i mod folds; by default every image is a fold of its own, up
+            to :data:`MOST_FOLDS`.
         result: the calibration of all images, if it exists already: by the same method, with the
             same prior, data and unknowns. Images that it left out as outliers are neither used nor
             held out.
@@ -147,7 +150,7 @@ def cross_validate(
     """
     problem, plan, arguments = _one_problem(problem, arguments, "jaxcal.cross_validate")
     count = problem.images
-    folds = count if folds is None else whole_number("folds", folds, 2, count)
+    folds = min(count, MOST_FOLDS) if folds is None else whole_number("folds", folds, 2, count)
     given, result = problem, _full_calibration(problem, result, plan, arguments)
     problem, xp = _used(problem, result)
     fold = np.arange(count) % folds

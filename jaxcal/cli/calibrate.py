@@ -35,9 +35,6 @@ if TYPE_CHECKING:
     from jaxcal.result.calibration import Calibration
     from jaxcal.result.transform import SaveFormat
 
-MOST_FOLDS = 100
-"""With more images than this, cross-validation holds out several at a time."""
-
 EXPORTS: tuple[SaveFormat, ...] = ("plus", "slicer", "itk", "ros", "tusrec", "numpy")
 
 
@@ -404,8 +401,7 @@ def _resampled(
     problem = Problem.from_recording(recording)
     arguments = vars(request)
     if cross_validate:
-        folds = min(problem.images, MOST_FOLDS)
-        held_out = resampling.cross_validate(problem, folds=folds, result=result, **arguments)
+        held_out = resampling.cross_validate(problem, result=result, **arguments)
         found["cross_validation"] = cross_validation_record(held_out, result)
     if draws is not None:
         scatter = resampling.bootstrap(problem, draws, result=result, **arguments)

@@ -19,7 +19,14 @@ from jaxcal.data.probe import CurvilinearProbe
 from jaxcal.data.recording import MINIMUM_IMAGES, Images, Kind, Recording, images_of, make_images
 from jaxcal.data.sound import WATER_M_S
 from jaxcal.runtime.array_types import AnyArray, Float, HeldArray
-from jaxcal.runtime.arrays import array_module, array_tree, each_image, is_traced, static
+from jaxcal.runtime.arrays import (
+    array_module,
+    array_tree,
+    each_image,
+    is_traced,
+    map_arrays,
+    static,
+)
 from jaxcal.runtime.jax_modes import importing_jax, in_own_modes
 from jaxcal.runtime.messages import counted, shown
 
@@ -278,11 +285,12 @@ def stack(problems: list[Problem]) -> Problem:
         problems: at least one; none of them is a batch.
 
     Returns:
-        One problem, whose arrays have the problems as their first axis.
+        One problem, whose arrays have the problems as their first axis. All have as many images as
+        the longest; images added to a shorter one come last and are masked out.
 
     Raises:
-        InputError: none at all, something else than problems, or where they differ in the number of
-            images or in what they hold.
+        InputError: none at all, something else than problems, or where they differ in what they
+            hold.
     """
     import jax
     import jax.numpy as jnp
@@ -294,11 +302,6 @@ def stack(problems: list[Problem]) -> Problem:
             raise InputError(f"stack takes problems, {index} is {type(problem).__name__}")
     first = problems[0]
     for index, problem in enumerate(problems):
-        if problem.images != first.images:
-            raise InputError(
-                f"problem {index} has {counted(problem.images, 'image')}, problem 0 has "
-                f"{first.images}: pad the shorter one with images that are masked out"
-            )
         if jax.tree.structure(problem) != jax.tree.structure(first):
             unlike = [
                 name
@@ -311,6 +314,8 @@ def stack(problems: list[Problem]) -> Problem:
                 "these to both, or to neither"
             )
 
+    most = max(problem.images for problem in problems)
+
     def stacked(*leaves: Any) -> Any:
         if is_traced(*leaves):
             return jnp.stack(leaves)
@@ -319,7 +324,20 @@ def stack(problems: list[Problem]) -> Problem:
         kept = [leaf.sharding for leaf in leaves if isinstance(leaf, jax.Array) and leaf.committed]
         return jax.device_put(np.stack(leaves), *kept[:1])
 
-    return jax.tree.map(stacked, *problems)
+    return jax.tree.map(stacked, *(_lengthened(problem, most) for problem in problems))
+
+
+def _lengthened(problem: Problem, images: int) -> Problem:
+    """The problem with so many images; those added repeat the last one and are masked out."""
+    count = problem.images
+    if count in (0, images):
+        return problem
+    if not is_traced(problem):
+        problem = map_arrays(np.asarray, problem)  # JAX would compile a program for every size
+    rows = np.minimum(np.arange(images), count - 1)
+    longer = each_image(problem, lambda values, axis: values.take(rows, axis))
+    added = np.arange(images) >= count
+    return replace(longer, mask=longer.mask * (~added).astype(longer.mask.dtype))
 
 
 def as_problem(value: Any, name: str) -> Problem:
@@ -354,7 +372,7 @@ def as_batch(value: Any, name: str) -> Problem:
     """The batch of problems that a caller gave; a list of problems or recordings is stacked.
 
     Raises:
-        InputError: anything else, or problems that differ in their number of images or in parts.
+        InputError: anything else, or problems that differ in what they hold.
     """
     if isinstance(value, list | tuple):
         if not value:
