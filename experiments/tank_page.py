@@ -5,9 +5,11 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 
 from tank_run import Run
+from tank_sensitivity import EXACT_ROBOT, LABELS
 
 from jaxcal.io.atomic import write_text
 
@@ -81,18 +83,25 @@ def joint() -> str:
 
 
 def statements() -> str:
-    """Every statement with its evidence."""
-    return markdown(
-        ["section", "statement", "verdict", "evidence"],
-        [
-            [row["section"], row["statement"], row["verdict"], row["evidence"]]
-            for row in rows("_statements")
-        ],
-    )
+    """Every statement with its verdict, and its evidence in parts."""
+    lines = []
+    for row in rows("_statements"):
+        statement = row["statement"]
+        source = row["section"]
+        if statement.startswith("(ours) "):
+            source, statement = f"ours, on {source}", statement.removeprefix("(ours) ")
+        verdict = row["verdict"].replace("see figures", "no verdict")
+        lines.append(f"- ({source}) *{statement}*: **{verdict}**.")
+        parts = row["evidence"].replace("+-", "±").split("; ")
+        lines += [f"    - {part}" for part in parts]
+    return "\n".join(lines)
 
 
 def sensitivity() -> str:
     """Errors of X against each number."""
+    named = LABELS | {EXACT_ROBOT: EXACT_ROBOT.replace("element_mm", LABELS["element_mm"])}
+    told = rows("_sensitivity")
+    same = [False, *(row["axis"] == last["axis"] for last, row in pairwise(told))]
     return markdown(
         [
             "",
@@ -106,7 +115,7 @@ def sensitivity() -> str:
         ],
         [
             [
-                row["axis"],
+                "" if repeated else named[row["axis"]],
                 f"{float(row['value']):g}",
                 *(
                     f"{number(row, f'{name}_exact_mm', '.3f')} ± "
@@ -119,7 +128,7 @@ def sensitivity() -> str:
                 f"{number(row, 'joint_over_without_exact_percent', '+.0f')} ± "
                 f"{number(row, 'joint_over_without_exact_half', '.0f')}",
             ]
-            for row in rows("_sensitivity")
+            for row, repeated in zip(told, same, strict=True)
         ],
     )
 

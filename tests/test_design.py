@@ -78,7 +78,7 @@ def test_gain_is_that_of_brute_force_and_its_gradient_that_of_differences():
     candidates = some(60, model=model)
     information = model.information(candidates.poses[:9]) + model.beliefs()
     covariance = covariance_of(information)
-    weight = tre_weight(candidates.constraints.region.grid(), model)
+    weight = design.tre_weight(candidates.constraints.region.grid(), model)
     rows = model.jacobian(candidates.poses)
     quick = gains(rows, covariance, weight)
     volume = gains(rows, covariance, None)
@@ -244,6 +244,8 @@ for call, said in (
     (lambda: design.known_information("x", candidates.model, []), "result must be made by"),
     (lambda: design.plan_figure("plan"), "plan must be made by jaxcal.design.plan"),
     (lambda: design.gain(np.eye(3), np.eye(9), np.eye(9), candidates.model), "pose must have"),
+    (lambda: design.tre_weight(np.eye(2), candidates.model), "points must have shape (m, 3), not"),
+    (lambda: design.tre_weight(np.eye(3), "m"), "model must be made by jaxcal.design.Model"),
     (lambda: design.Constraints(cone_deg="40"), "cone_deg must be 0 to 85 degrees, not '40'"),
     (lambda: design.Constraints(reach_mm=3), "reach_mm must be two mm in order, not 3"),
     (lambda: design.Constraints(allowed="all"), "allowed must be a function of poses"),

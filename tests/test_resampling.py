@@ -86,7 +86,8 @@ def test_a_bad_image_has_the_most_influence(data):
 def test_many_images_are_held_out_several_at_a_time(data, whole, monkeypatch):
     monkeypatch.setattr(resampling, "MOST_FOLDS", COUNT - 1)
     found = cross_validate(data, result=whole, **CONVENTIONAL)
-    assert found.converged.all() and found.converged.shape == (COUNT - 1,)
+    assert found.converged.all()
+    assert found.converged.shape == (COUNT - 1,)
     np.testing.assert_array_equal(found.moved[0], found.moved[COUNT - 1])
 
 

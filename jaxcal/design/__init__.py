@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from jaxcal.design.constraints import Region as Region
     from jaxcal.design.count import images_to as images_to
     from jaxcal.design.criteria import gain as gain
+    from jaxcal.design.criteria import tre_weight as tre_weight
     from jaxcal.design.figure import plan_figure as plan_figure
     from jaxcal.design.greedy import Rules as Rules
     from jaxcal.design.information import Model as Model
@@ -65,6 +66,7 @@ _HOME = {
     "plan_figure": "figure",
     "pose_in_words": "words",
     "simulate_errors": "simulated",
+    "tre_weight": "criteria",
 }
 
 __all__ = [*_HOME]  # pyright: ignore[reportUnsupportedDunderAll]

@@ -35,7 +35,7 @@ from jaxcal.design.information import Known, Model, covariance_of
 from jaxcal.diagnostics.intervals import student_variance
 from jaxcal.model.image_points import mean_of_squares, point_jacobian
 from jaxcal.runtime.array_types import AnyArray, Array, Float, Int
-from jaxcal.runtime.given_values import check_made
+from jaxcal.runtime.given_values import check_made, real_array
 
 Criterion = Literal["tre", "rp", "d"]
 _PIECE = 800
@@ -53,7 +53,19 @@ def check_criterion(criterion: str) -> None:
 
 
 def tre_weight(points: Float[np.ndarray, "m 3"], model: Model) -> Float[np.ndarray, "p p"]:
-    """W of the mean squared TRE over image points [lateral, 0, axial], mm."""
+    """W of the mean squared TRE over image points.
+
+    Args:
+        points: [lateral, 0, axial] mm, e.g. :meth:`Region.grid`.
+        model: X, target and SDs; p is the number of its unknowns.
+
+    Raises:
+        InputError: points of another shape, or something else than a model.
+    """
+    check_made("model", model, Model, "jaxcal.design.Model")
+    points = real_array(points, "points")
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(f"points must have shape (m, 3), not {points.shape}")
     moved = point_jacobian(points[:, [0, 2]], model.blocks, model.face_offset_mm)
     return mean_of_squares(moved)
 
@@ -100,7 +112,7 @@ def gain(
     Args:
         pose: probe -> tracker, mm.
         covariance: S, of all unknowns before this image (mm, rad, and log units of pixel scales).
-        weight: W, by which the criterion is the trace tr(W S).
+        weight: W, by which the criterion is the trace tr(W S), e.g. of :func:`tre_weight`.
         model: X, target and SDs.
     """
     import jax.numpy as jnp
