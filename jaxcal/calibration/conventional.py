@@ -17,7 +17,7 @@ from dataclasses import replace
 import numpy as np
 
 from jaxcal.data.problem import Problem
-from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns
+from jaxcal.diagnostics.image_errors import ImageErrors
 from jaxcal.diagnostics.uncertainty import LARGEST_SD, inverses, mm_at_target, threshold
 from jaxcal.model.unknowns import FURTHER, block_slice, count_unknowns
 from jaxcal.result.calibration import Calibration, Linearisation, Medium, Status
@@ -57,8 +57,7 @@ def closed_form_answer(problem: Problem, plan: SolvePlan) -> Calibration | None:
 def _with_uncertainty(found: ClosedForm, problem: Problem, plan: SolvePlan) -> Calibration | None:
     """The closed form as a calibration without its problem; None where poses are degenerate."""
     blocks, eps = plan.blocks, float(np.finfo(float).eps)
-    unknowns = Unknowns.of_closed_form(found, problem)
-    seen = ImageErrors.of(unknowns, map_arrays(lambda a: a[None], problem), blocks)
+    seen = ImageErrors.of_closed_form(found, problem, blocks)
     plane = np.zeros_like(seen.mask)
     residual, axial = seen.from_circle(plane)
     rows = seen.circle_rows(axial).reshape(-1, count_unknowns(blocks))
@@ -81,7 +80,7 @@ def _with_uncertainty(found: ClosedForm, problem: Problem, plan: SolvePlan) -> C
     if weak:
         covariance = np.full_like(covariance, np.nan)
 
-    parts = [unknowns.further[name] for name in FURTHER if name in blocks]
+    parts = [seen.unknowns.further[name] for name in FURTHER if name in blocks]
     further = [part[0] for block in parts for part in block]
     gradient = np.abs(errors @ rows)
     length = np.sqrt(np.diag(information) * objective)

@@ -30,7 +30,7 @@ from jaxcal.model.unknowns import (
     with_prior,
 )
 from jaxcal.runtime.array_types import AnyArray, Float
-from jaxcal.runtime.arrays import array_module
+from jaxcal.runtime.arrays import array_module, map_arrays
 from jaxcal.solvers.plan import TUNED
 
 if TYPE_CHECKING:
@@ -116,6 +116,12 @@ class ImageErrors:
         """The errors of calibrations with one leading axis, which hold their problem."""
         assert answer.problem is not None
         return cls.of(Unknowns.of(answer), answer.problem, answer.blocks)
+
+    @classmethod
+    def of_closed_form(cls, found: ClosedForm, problem: Problem, blocks: Blocks) -> ImageErrors:
+        """The errors of a closed form of one problem, with a leading axis of length 1."""
+        alone = map_arrays(lambda leaf: np.asarray(leaf, float)[None], problem)
+        return cls.of(Unknowns.of_closed_form(found, problem), alone, blocks)
 
     @classmethod
     def of(

@@ -24,7 +24,7 @@ from jaxcal.data.problem import Problem
 from jaxcal.data.recording import LARGEST, Recording
 from jaxcal.design.candidates import seen_region
 from jaxcal.design.constraints import Region
-from jaxcal.diagnostics.image_errors import Unknowns, noise_covariance
+from jaxcal.diagnostics.image_errors import ImageErrors, noise_covariance
 from jaxcal.diagnostics.influence import (
     KINDS,
     Influence,
@@ -45,7 +45,6 @@ from jaxcal.model.image_points import distance, mean_of_squares
 from jaxcal.report.contradictions import contradictions
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Float
-from jaxcal.runtime.arrays import map_arrays
 from jaxcal.runtime.given_values import real_array
 from jaxcal.solvers.closed_form.calibrate import calibrate_closed_form
 
@@ -272,12 +271,10 @@ def _comparison(
     scale = np.ones(2)
     if other.scale_mm_per_px is not None:
         scale = np.asarray(other.scale_mm_per_px) / spacing
-    alone = map_arrays(lambda leaf: np.asarray(leaf, float)[None], problem)
-    unknowns = Unknowns.of_closed_form(other, problem)
     noise = np.asarray(noise_covariance(answer, problem), float)
     if not np.isfinite(noise[used]).all():
         return None
-    fit = conventional_fit(unknowns, alone, answer.blocks, used, noise)
+    fit = conventional_fit(ImageErrors.of_closed_form(other, problem, answer.blocks), used, noise)
     jacobian = image_jacobian(answer, grid)
     error = np.einsum("mia,ab,mib->", jacobian, fit.covariance, jacobian) / len(grid)
     gaussian = np.einsum("mia,ab,mib->", jacobian, found.model_covariance, jacobian) / len(grid)
