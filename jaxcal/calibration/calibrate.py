@@ -359,8 +359,8 @@ def prepare(
     blocks = RIGID + tuple(name for name in FURTHER if name in request.estimate)
     prior_sd = None
     if kind == "gaussian" and with_prior(blocks):
-        asked = {"sound-speed": request.sound_speed_sd, "delay": request.delay_sd}
-        believed = [array(asked.get(name, TABLE[name].prior_sd)) for name in with_prior(blocks)]
+        rows = [TABLE[name] for name in with_prior(blocks)]
+        believed = [array(getattr(request, row.prior_name, row.prior_sd)) for row in rows]
         prior_sd = array_module(believed).stack(believed)
     given = Given(array(request.sigma), array(request.tracker_sd), prior_sd)
     components = 2 if channels else 3
@@ -401,16 +401,16 @@ def check_request(request: Request) -> Prior:
         prior = "bounded"
     _check_combination(request, prior)
     tiny = np.finfo(float).tiny
-    for name, least, one in (
-        ("sound_speed_sd", tiny, True),
-        ("delay_sd", tiny, True),
-        ("tracker_sd", 0.0, True),
-        ("sigma", tiny, False),
-        ("max_elevation", 0.0, False),
+    priors = [(TABLE[name].prior_name, tiny, True, TABLE[name].prior_unit) for name in MEDIUM]
+    for name, least, one, unit in (
+        *priors,
+        ("tracker_sd", 0.0, True, "mm"),
+        ("sigma", tiny, False, "mm"),
+        ("max_elevation", 0.0, False, "mm"),
     ):
         value = getattr(request, name)
         if value is not getattr(Request, name):  # the default
-            check_size(name, value, least, one=one)
+            check_size(name, value, least, one=one, unit=unit)
     return prior
 
 
@@ -431,7 +431,8 @@ def _check_combination(request: Request, kind: Prior) -> None:
         raise InputError(f"the prior {request.prior} does not go with the method {request.method}")
     if kind != "gaussian" and (request.sigma is not None or request.tracker_sd is not None):
         raise InputError("sigma and tracker_sd belong to the joint method's gaussian prior")
-    for name, unknown in zip(("sound_speed_sd", "delay_sd"), MEDIUM, strict=True):
+    for unknown in MEDIUM:
+        name = TABLE[unknown].prior_name
         if getattr(request, name) is getattr(Request, name):  # the default
             continue
         if kind != "gaussian" or unknown not in request.estimate:
