@@ -135,10 +135,9 @@ def test_crosswire(crosswire):
 ALONE = """
 import json, sys, time
 import numpy
-from types import SimpleNamespace
 data = numpy.load(sys.argv[1])
-images = SimpleNamespace(kind="pixel", spacing_mm=None, face_offset_mm=0.0, **data)
-from jaxcal import calibrate_closed_form
+from jaxcal import Problem, calibrate_closed_form
+images = Problem.from_arrays(**data, kind="pixel")
 spent = []
 for _ in range(20):
     start = time.process_time()

@@ -322,18 +322,21 @@ def stack(problems: list[Problem]) -> Problem:
     return jax.tree.map(stacked, *problems)
 
 
-def as_problem(value: Any, name: str) -> Problem:
+def as_problem(value: Any, name: str, *, channels: bool = True) -> Problem:
     """The problem that a caller gave; recordings and images are converted.
 
     Args:
         value: a problem, a recording or one set of images.
         name: of the function that was called, for messages.
+        channels: False if points are enough: times of flight beside points are not read.
 
     Raises:
         InputError: anything else, with what to do.
     """
     if isinstance(value, Problem):
         return value
+    if not channels and isinstance(value, Recording):
+        value = value if value.calibration.kind == "time_of_flight" else value.calibration
     if isinstance(value, Recording | Images):
         return Problem.from_recording(value)
     if isinstance(value, str | os.PathLike):

@@ -46,7 +46,7 @@ from jaxcal.report.contradictions import contradictions
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.given_values import real_array
-from jaxcal.solvers.closed_form.calibrate import calibrate_closed_form
+from jaxcal.solvers.closed_form.single import solve_problem
 
 GOOD_MM = 0.5
 """Largest error to expect at the image (root mean square) that is called good."""
@@ -102,7 +102,7 @@ def accuracy_record(
         "tre": tre,
         "limits": _limits(answer, found, weight),
         "influence": influence,
-        "comparison": _comparison(answer, recording, found, grid),
+        "comparison": _comparison(answer, found, grid),
     }
 
 
@@ -252,19 +252,19 @@ def _unmodelled(answer: Calibration, grid: Float[np.ndarray, "m 2"]) -> dict[str
 
 
 def _comparison(
-    answer: Calibration, recording: Recording, found: Influence, grid: Float[np.ndarray, "m 2"]
+    answer: Calibration, found: Influence, grid: Float[np.ndarray, "m 2"]
 ) -> dict[str, Any] | None:
     """Compares an answer of another method with the conventional fit of the same images."""
     estimate = tuple(name for name in ("scale",) if name in answer.blocks)
     further = {"sound-speed", "delay"} & set(answer.blocks)
-    images, problem = recording.calibration, answer.problem
+    problem = answer.problem
     if answer.method == "conventional" or further or problem is None:
         return None
     if answer.data == "channels":
         return None
     used = np.asarray(answer.mask) > 0
     try:
-        other = calibrate_closed_form(replace(images, mask=used), estimate=estimate)
+        other = solve_problem(replace(problem, mask=used), estimate)
     except InputError:
         return None
     x, spacing = np.asarray(other.image_to_probe), np.asarray(problem.spacing, float)

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from jaxcal.data.problem import Problem, as_batch, check_shapes
+from jaxcal.data.problem import Problem, as_batch, as_problem, check_shapes
 from jaxcal.model.unknowns import unknown_names
 from jaxcal.runtime.arrays import is_traced
 from jaxcal.solvers.closed_form.single import ClosedForm, solve_problem
@@ -45,10 +43,11 @@ def calibrate_closed_form(
     names = unknown_names(estimate)
     if isinstance(problem, list | tuple):
         problem = as_batch(problem, "jaxcal.calibrate_closed_form")
-    if isinstance(problem, Problem):
-        check_shapes(problem)
-    if np.ndim(getattr(problem, "mask", ())) > 1 or is_traced(problem):
+    else:
+        problem = as_problem(problem, "jaxcal.calibrate_closed_form", channels=False)
+    check_shapes(problem)
+    if problem.batch_shape or is_traced(problem):
         from jaxcal.solvers.closed_form.batch import solve_batch
 
-        return solve_batch(problem, names)  # pyright: ignore[reportArgumentType]
-    return solve_problem(problem, names)  # pyright: ignore[reportArgumentType]
+        return solve_batch(problem, names)
+    return solve_problem(problem, names)
