@@ -199,7 +199,7 @@ def plain_descents(reduced, starts: int, seed: int) -> np.ndarray:
 
 
 def reduced_of(images, estimate=()):
-    return reduce(*image_data(images, estimate))
+    return reduce(*image_data(jaxcal.Problem.from_recording(images), estimate))
 
 
 def test_five_images_with_large_errors_need_the_relaxation_and_trap_searches():
