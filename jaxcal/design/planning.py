@@ -314,7 +314,7 @@ def check_candidates(candidates: Candidates) -> None:
             f"the noise model's SDs must be {low:g} to {high:g} mm at all candidate poses"
         )
     lever = np.sqrt(np.mean(np.sum(model.targets(every) ** 2, axis=1)))
-    scale = mm_at_target(lever, model.blocks)
+    scale = mm_at_target(np.asarray(lever), model.blocks)
     found = model.information(every) / (scale[:, None] * scale)
     values, vectors = np.linalg.eigh(found)
     if values[0] > _SINGULAR * values[-1]:
