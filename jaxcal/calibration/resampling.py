@@ -460,8 +460,7 @@ def _with_rows(problem: Problem, rows: AnyArray, mask: Float[AnyArray, "k n"]) -
 
 def _unknowns(result: Calibration) -> tuple[Any, Any, Any, Values]:
     """Rotation and translation of X, the target, and the free further unknowns by name."""
-    x, further = result.image_to_probe, result.linearisation.further
-    values = {} if further is None else split_further(further, result.blocks)
+    x, values = result.image_to_probe, split_further(result.linearisation.further, result.blocks)
     return x[..., :3, :3], x[..., :3, 3], result.point, values
 
 

@@ -41,6 +41,9 @@ if TYPE_CHECKING:
 
 Array = np.ndarray
 
+KINDS = ("lateral", "range", "elevational")
+"""Kinds of errors."""
+
 
 @dataclass(frozen=True)
 class Unknowns:
@@ -63,8 +66,8 @@ class Unknowns:
     @classmethod
     def of(cls, answer: Calibration) -> Unknowns:
         """The unknowns of calibrations with one leading axis."""
-        x, values = np.asarray(answer.image_to_probe), answer.linearisation.further
-        further = {} if values is None else split_further(np.asarray(values), answer.blocks)
+        x = np.asarray(answer.image_to_probe)
+        further = split_further(answer.linearisation.further, answer.blocks)
         return cls(x[:, :3, :3], x[:, :3, 3], np.asarray(answer.point), further)
 
     @classmethod

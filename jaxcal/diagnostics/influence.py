@@ -34,6 +34,7 @@ import numpy as np
 
 from jaxcal import CalibrationError, InputError
 from jaxcal.diagnostics.image_errors import (
+    KINDS,
     ImageErrors,
     Whitened,
     further_prior,
@@ -50,9 +51,6 @@ if TYPE_CHECKING:
     from jaxcal.result.calibration import Calibration
 
 Array = np.ndarray
-
-KINDS = ("lateral", "range", "elevational")
-"""Kinds of errors."""
 
 _LEAST_LEFT = 1e-6
 """Least share of an error's variance after the fit, for images that the unknowns depend on."""

@@ -290,13 +290,17 @@ def with_prior(blocks: Blocks) -> Blocks:
 
 
 def split_further(values: Any, blocks: Blocks) -> dict[str, list[Any]]:
-    """Arrays (..., k) of all free further unknowns as components of each, by name."""
-    first = RIGID_UNKNOWNS
+    """The components of each free further unknown, by name.
+
+    Args:
+        values: all of them, (..., k); None if there are none.
+        blocks: the free unknowns.
+    """
     found = {}
     for name in FURTHER:
         if name in blocks:
             at = block_slice(blocks, name)
-            found[name] = [values[..., k - first] for k in range(at.start, at.stop)]
+            found[name] = [values[..., k - RIGID_UNKNOWNS] for k in range(at.start, at.stop)]
     return found
 
 

@@ -24,9 +24,8 @@ from jaxcal.data.problem import Problem
 from jaxcal.data.recording import LARGEST, Recording
 from jaxcal.design.candidates import seen_region
 from jaxcal.design.constraints import Region
-from jaxcal.diagnostics.image_errors import ImageErrors, noise_covariance
+from jaxcal.diagnostics.image_errors import KINDS, ImageErrors, noise_covariance
 from jaxcal.diagnostics.influence import (
-    KINDS,
     Influence,
     conventional_fit,
     excess,

@@ -17,7 +17,8 @@ from matplotlib.figure import Figure
 from jaxcal import InputError
 from jaxcal.data.poses import targets_in_images
 from jaxcal.data.recording import Recording
-from jaxcal.diagnostics.influence import KINDS, in_image, influence_of
+from jaxcal.diagnostics.image_errors import KINDS
+from jaxcal.diagnostics.influence import in_image, influence_of
 from jaxcal.diagnostics.intervals import image_jacobian, tre_at
 from jaxcal.diagnostics.outliers import outliers, suspects
 from jaxcal.model.image_points import mean_of_squares

@@ -179,7 +179,6 @@ def further_unknowns(answer: Calibration) -> dict[str, dict[str, Any]]:
         answer: one calibration in numpy arrays.
     """
     found, blocks = answer.linearisation, answer.blocks
-    further = {} if found.further is None else split_further(found.further, blocks)
     sd = np.sqrt(np.diagonal(answer.unknowns_covariance))
     prior: dict[str, Any] = {}
     if found.prior_sd is not None:
@@ -191,7 +190,7 @@ def further_unknowns(answer: Calibration) -> dict[str, dict[str, Any]]:
             "sd": sd[block_slice(blocks, name)],
             "prior_sd": prior.get(name),
         }
-        for name, values in further.items()
+        for name, values in split_further(found.further, blocks).items()
     }
 
 
