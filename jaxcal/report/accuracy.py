@@ -20,7 +20,6 @@ import numpy as np
 
 from jaxcal import InputError
 from jaxcal.data.poses import targets_in_images
-from jaxcal.data.problem import Problem
 from jaxcal.data.recording import LARGEST, Recording
 from jaxcal.design.candidates import seen_region
 from jaxcal.design.constraints import Region
@@ -82,9 +81,6 @@ def accuracy_record(
         return nothing
     if result.wrong_frames is not None:
         return nothing
-    problem = answer.problem
-    if problem is None:
-        answer = answer.with_problem(Problem.from_recording(recording)).numpy()
     region = region_of(answer, recording)
     grid = region.grid()[:, [0, 2]]
     weight = mean_of_squares(image_jacobian(answer, grid))
@@ -107,11 +103,10 @@ def accuracy_record(
 
 def as_solved(recording: Recording, answer: Calibration) -> Recording:
     """The recording with the images of the solve, in which every pose counts once."""
-    images, problem = recording.calibration, answer.problem
-    if problem is None:
-        return recording
+    problem = answer.problem
+    assert problem is not None
     images = replace(
-        images,
+        recording.calibration,
         poses=np.asarray(problem.poses, float),
         measurements=np.asarray(problem.measurements, float),
         mask=np.asarray(problem.mask) > 0,

@@ -136,7 +136,7 @@ def calibration_record(
         "point_covariance_mm2": answer.point_covariance if known else None,
         "observability": result.observability,
         "rms_mm": answer.rms,
-        **certificate_record(answer, solved),
+        **certificate_record(answer),
         "reconstruction_precision_mm": _precision(answer, images),
         "reconstruction_precision_set": "calibration" if tested is None else "test",
         "reconstruction_precision_images": int(np.sum(images.mask)),
