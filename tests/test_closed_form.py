@@ -328,6 +328,17 @@ def test_images_left_out_are_not_read():
     assert masked.objective_mm2 == pytest.approx(alone.objective_mm2, rel=1e-12)
 
 
+def test_times_of_flight_beside_points_are_not_read():
+    images, probe = drawn(6, 8), jaxcal.LinearProbe()
+    silent = dataclasses.replace(images, time_of_flight=np.full((8, probe.elements), np.nan))
+    recording = jaxcal.Recording(silent, probe=probe)
+    with pytest.raises(jaxcal.InputError):
+        jaxcal.Problem.from_recording(recording)
+    alone = jaxcal.calibrate_closed_form(images)
+    assert jaxcal.calibrate_closed_form(recording).rms_mm == alone.rms_mm
+    assert jaxcal.certify(recording, alone.image_to_probe).certified
+
+
 def test_an_unknown_sound_speed_is_an_axial_scale():
     """Points whose ranges are 3 % too long, with the lateral positions right."""
     images = drawn(2, 12, noise=0.0, offset=0.0)

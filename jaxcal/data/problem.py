@@ -353,8 +353,10 @@ def as_problem(value: Any, name: str, *, channels: bool = True) -> Problem:
     raise InputError(f"{name} takes a problem or a recording, not {kind}: {_HOW}")
 
 
-def as_batch(value: Any, name: str) -> Problem:
+def as_batch(value: Any, name: str, *, channels: bool = True) -> Problem:
     """The batch of problems that a caller gave; a list of problems or recordings is stacked.
+
+    Arguments are those of :func:`as_problem`.
 
     Raises:
         InputError: anything else, or problems that differ in their number of images or in parts.
@@ -362,8 +364,8 @@ def as_batch(value: Any, name: str) -> Problem:
     if isinstance(value, list | tuple):
         if not value:
             raise InputError(f"{name} takes at least one problem; the list is empty")
-        return stack([as_problem(each, name) for each in value])
-    return as_problem(value, name)
+        return stack([as_problem(each, name, channels=channels) for each in value])
+    return as_problem(value, name, channels=channels)
 
 
 def check_shapes(problem: Problem) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from jaxcal.data.problem import Problem, as_batch, as_problem, check_shapes
+from jaxcal.data.problem import Problem, as_batch, check_shapes
 from jaxcal.model.unknowns import unknown_names
 from jaxcal.runtime.arrays import is_traced
 from jaxcal.solvers.closed_form.single import ClosedForm, solve_problem
@@ -41,13 +41,10 @@ def calibrate_closed_form(
         InputError: other names in ``estimate``, data that cannot be used, fewer than 4 images.
     """
     names = unknown_names(estimate)
-    if isinstance(problem, list | tuple):
-        problem = as_batch(problem, "jaxcal.calibrate_closed_form")
-    else:
-        problem = as_problem(problem, "jaxcal.calibrate_closed_form", channels=False)
-    check_shapes(problem)
-    if problem.batch_shape or is_traced(problem):
+    problems = as_batch(problem, "jaxcal.calibrate_closed_form", channels=False)
+    check_shapes(problems)
+    if problems.batch_shape or is_traced(problems):
         from jaxcal.solvers.closed_form.batch import solve_batch
 
-        return solve_batch(problem, names)
-    return solve_problem(problem, names)
+        return solve_batch(problems, names)
+    return solve_problem(problems, names)
