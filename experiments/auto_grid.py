@@ -45,7 +45,7 @@ from jaxcal.runtime.compiler import fast_to_run
 from jaxcal.runtime.jax_cache import enable_compilation_cache
 from jaxcal.solvers.alternating import alternate
 from jaxcal.solvers.plan import Options
-from jaxcal.study.offsets import OffsetLaw, nominal_bound
+from jaxcal.study.offsets import LawName, nominal_bound
 from jaxcal.study.simulation import Experiment
 
 SEED = 20261124
@@ -69,7 +69,7 @@ COMPARED = (
 class Cell:
     """One condition."""
 
-    law: OffsetLaw
+    law: LawName
     images: int
     elevation_mm: float
     noise_mm: float

@@ -48,11 +48,11 @@ from common import (
 from jaxtyping import Array
 
 from jaxcal import Protocol, calibrate_batch
-from jaxcal.study.offsets import OffsetLaw
+from jaxcal.study.offsets import LawName
 from jaxcal.study.simulation import Experiment
 
 SEED = 20261126
-LAWS: tuple[OffsetLaw, ...] = ("uniform", "normal", "heavy-tailed", "triangular")
+LAWS: tuple[LawName, ...] = ("uniform", "normal", "heavy-tailed", "triangular")
 FEW_IMAGES = (12, 20)
 FEW_IMAGES_CELL = (2.0, 2.0)
 QUICK = ((1.0, 2.0), (3.0, 6.0))
@@ -71,7 +71,7 @@ HEADER = [
 ]  # fmt: skip
 
 
-def draw(law: OffsetLaw, images: int, indices: Array, elevation: float, noise: float) -> Experiment:
+def draw(law: LawName, images: int, indices: Array, elevation: float, noise: float) -> Experiment:
     """Experiments of one cell."""
     protocol = Protocol(
         images=images, elevation_distribution=law, elevation_mm=elevation, noise_mm=noise
@@ -80,7 +80,7 @@ def draw(law: OffsetLaw, images: int, indices: Array, elevation: float, noise: f
 
 
 def limits(
-    law: OffsetLaw, size: float, drawn: Experiment, start, indices: Array, told: bool = True
+    law: LawName, size: float, drawn: Experiment, start, indices: Array, told: bool = True
 ) -> list[Mean]:
     """The limit's answer to every trial, from a calibration nearby."""
     covariances = np.asarray(drawn.covariance)
@@ -98,7 +98,7 @@ def limits(
 
 
 def run_cell(
-    law: OffsetLaw, images: int, elevation: float, noise: float, indices: Array
+    law: LawName, images: int, elevation: float, noise: float, indices: Array
 ) -> list[object]:
     """One row of the table."""
     drawn = draw(law, images, indices, elevation, noise)
@@ -134,7 +134,7 @@ def main() -> None:
     quick, folder = arguments(__doc__)
     trials = 50 if quick else 200
     grid = QUICK if quick else tuple(itertools.product(ELEVATIONS_MM[1:], NOISES_MM))
-    cells: list[tuple[OffsetLaw, int, float, float]] = []
+    cells: list[tuple[LawName, int, float, float]] = []
     for law, (elevation, noise) in itertools.product(LAWS, grid):
         cells.append((law, 50, elevation, noise))
     for images, law in itertools.product(FEW_IMAGES, LAWS):
@@ -151,7 +151,7 @@ def main() -> None:
 
 
 def again(
-    cells: list[tuple[OffsetLaw, int, float, float]], rows: list[list[object]], trials: int
+    cells: list[tuple[LawName, int, float, float]], rows: list[list[object]], trials: int
 ) -> list[list[object]]:
     """Cells above the bound on other draws."""
     found = []
@@ -164,7 +164,7 @@ def again(
     return found
 
 
-def ratios(rows: list[list[object]], law: OffsetLaw | None, images: int) -> np.ndarray:
+def ratios(rows: list[list[object]], law: LawName | None, images: int) -> np.ndarray:
     """Columns elevation, noise, auto_over_bayes, ci95_half of the rows of a law and size."""
     picked = [row for row in rows if row[1] == images and law in (None, row[0])]
     return np.array([[row[2], row[3], row[9], row[10]] for row in picked], float)

@@ -23,10 +23,10 @@ from common import arguments, machine, precision, show, write_table
 from jaxtyping import Array
 
 from jaxcal.backend import RIGID, Parameters, measurement_residual, retract
-from jaxcal.study.offsets import DEGREES_OF_FREEDOM, OffsetLaw, standard_deviation
+from jaxcal.study.offsets import DEGREES_OF_FREEDOM, LawName, standard_deviation
 
 SEED = 20261127
-CONDITIONS: tuple[tuple[OffsetLaw, int], ...] = (
+CONDITIONS: tuple[tuple[LawName, int], ...] = (
     ("uniform", 50), ("triangular", 50), ("heavy-tailed", 50), ("uniform", 12),
 )  # fmt: skip
 SIZE_MM, NOISE_MM = 2.0, 2.0
@@ -36,7 +36,7 @@ HEADER = [
 ]  # fmt: skip
 
 
-def log_law(law: OffsetLaw, u: Array) -> Array:
+def log_law(law: LawName, u: Array) -> Array:
     """Log density of offsets in sizes, up to a constant; -inf beyond an edge."""
     if law == "normal":
         return -0.5 * u**2
@@ -73,7 +73,7 @@ def shapes(starts: Parameters, problems) -> Array:
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def walk(law: OffsetLaw, steps: int, starts: Parameters, origins, roots: Array, problems):
+def walk(law: LawName, steps: int, starts: Parameters, origins, roots: Array, problems):
     """Means of the two halves of every chain, second moments, and the share of accepted steps."""
     burning = steps // 5
     half = (steps - burning) // 2

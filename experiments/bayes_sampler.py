@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from jaxcal.study.offsets import DEGREES_OF_FREEDOM, OffsetLaw, standard_deviation
+from jaxcal.study.offsets import DEGREES_OF_FREEDOM, LawName, standard_deviation
 
 UNKNOWNS = 9
 ADAPTING, DRAWS, ROUNDS = 768, 1024, 20
@@ -33,7 +33,7 @@ STEEPNESS = 30.0
 """While the proposal adapts, laws fall beyond an edge by this many e-foldings within one size."""
 
 
-def log_law(law: OffsetLaw, u: Float[np.ndarray, "n draws"]) -> Float[np.ndarray, " draws"]:
+def log_law(law: LawName, u: Float[np.ndarray, "n draws"]) -> Float[np.ndarray, " draws"]:
     """Log density of all offsets together, in sizes, up to a constant; -inf beyond an edge."""
     if law == "normal":
         return -0.5 * np.einsum("nd,nd->d", u, u)
@@ -53,7 +53,7 @@ def log_uniform_untold(u: Float[np.ndarray, "n draws"]) -> Float[np.ndarray, " d
     return -len(u) * np.log(np.max(np.abs(u), axis=0))
 
 
-def soft_log_law(law: OffsetLaw, u: Float[np.ndarray, "n draws"]) -> Float[np.ndarray, " draws"]:
+def soft_log_law(law: LawName, u: Float[np.ndarray, "n draws"]) -> Float[np.ndarray, " draws"]:
     """The same with slopes beyond the edges, for a proposal to find its way inside."""
     if law in ("normal", "heavy-tailed"):
         return log_law(law, u)
@@ -80,7 +80,7 @@ class Target:
         whitening: lower triangular inverse root of every covariance.
     """
 
-    law: OffsetLaw
+    law: LawName
     size: float
     told: bool
     position: Float[np.ndarray, "n 3"]
@@ -160,7 +160,7 @@ class Mean:
 
 
 def posterior_mean(
-    law: OffsetLaw,
+    law: LawName,
     size: float,
     data: tuple[np.ndarray, np.ndarray, np.ndarray],
     start: tuple[np.ndarray, np.ndarray],
@@ -227,7 +227,7 @@ def posterior_mean(
 
 
 def about(
-    law: OffsetLaw, size: tuple[float, bool], data: tuple, whitening: np.ndarray, x, c
+    law: LawName, size: tuple[float, bool], data: tuple, whitening: np.ndarray, x, c
 ) -> Target:
     """The posterior about X and c."""
     poses, points, _ = data

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxcal import Problem, Protocol, reconstruction_precision, simulate
 from jaxcal.io.atomic import atomic_path
-from jaxcal.study.laws import OffsetLaw
+from jaxcal.study.laws import LawName
 from jaxcal.study.simulation import NUMBERS, Experiment
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ ELEVATIONS_MM = (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 5.0)
 NOISES_MM = (0.0, 0.5, 2.0, 4.0, 6.0, 8.0, 10.0)
 """The grid of the paper's Tables 1 and 2."""
 
-LAWS: tuple[OffsetLaw, ...] = ("uniform", "normal", "one-sided", "heavy-tailed", "triangular")
+LAWS: tuple[LawName, ...] = ("uniform", "normal", "one-sided", "heavy-tailed", "triangular")
 """Of the offsets, in most experiments."""
 
 

@@ -28,10 +28,10 @@ from common import (
 )
 
 from jaxcal import Protocol, calibrate_batch, predicted_tre, transform_intervals
-from jaxcal.study.laws import OffsetLaw
+from jaxcal.study.laws import LawName
 
 SEED = 20261125
-LAWS: tuple[OffsetLaw, ...] = ("uniform", "normal", "heavy-tailed")
+LAWS: tuple[LawName, ...] = ("uniform", "normal", "heavy-tailed")
 AXES = ("t_lateral", "t_elevational", "t_axial", "r_lateral", "r_elevational", "r_axial")
 SIZES_MM = ((2.0, 2.0), (1.0, 0.5), (5.0, 2.0))
 """Offsets and noise."""

@@ -34,10 +34,10 @@ from jaxtyping import Array
 
 from jaxcal import Protocol, calibrate_batch, simulate
 from jaxcal.runtime.jax_cache import enable_compilation_cache
-from jaxcal.study.offsets import OffsetLaw
+from jaxcal.study.offsets import LawName
 
 SEED = 20261126
-LAWS: tuple[OffsetLaw, ...] = ("uniform", "normal", "heavy-tailed")
+LAWS: tuple[LawName, ...] = ("uniform", "normal", "heavy-tailed")
 SIZES_MM = ((0.5, 0.5), (0.5, 10.0), (2.0, 2.0), (5.0, 0.5), (5.0, 10.0))
 """Elevational size and noise: the corners of the paper's grid without zeros, and its middle."""
 FRACTIONS = (0.0, 0.1, 0.3)
@@ -51,7 +51,7 @@ LARGEST_RATIO, LEAST_NAMED, MOST_FALSE = 1.10, 0.95, 0.02
 class Cell:
     """One condition."""
 
-    law: OffsetLaw
+    law: LawName
     elevation_mm: float
     noise_mm: float
     fraction: float

@@ -25,10 +25,10 @@ import jaxcal
 from jaxcal.diagnostics.misfits import misfits
 from jaxcal.diagnostics.outliers import outliers, suspects
 from jaxcal.runtime.jax_cache import enable_compilation_cache
-from jaxcal.study.laws import OffsetLaw
+from jaxcal.study.laws import LawName
 
 SEED = 20261124
-LAWS: tuple[OffsetLaw, ...] = ("uniform", "normal", "heavy-tailed")
+LAWS: tuple[LawName, ...] = ("uniform", "normal", "heavy-tailed")
 FAULTS = ("none", "three images", "drift")
 KINDS = {
     "heavier tails": "tails", "skewed to one side": "one side", "grow with depth": "depth",
@@ -41,7 +41,7 @@ HEADER = [
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
-def draw(law: OffsetLaw, images: int, fault: str, indices: Array):
+def draw(law: LawName, images: int, fault: str, indices: Array):
     """Problems of one condition."""
     protocol = jaxcal.Protocol(
         images=images, test_images=2, elevation_distribution=law, elevation_mm=1.0, noise_mm=1.0

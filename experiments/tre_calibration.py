@@ -37,7 +37,7 @@ from jaxcal.data.probe import L14_5
 from jaxcal.diagnostics.intervals import tre_at, tre_over
 from jaxcal.model import unknowns
 from jaxcal.solvers.names import Method, PriorName
-from jaxcal.study.offsets import OffsetLaw
+from jaxcal.study.offsets import LawName
 
 SEED = 20261126
 POINTS_MM = np.stack(
@@ -52,7 +52,7 @@ FIELDS = {
 }
 """Where the target is: points to look at, bounds of its place and of its offsets, mm."""
 SIZES_MM = (1.5, 5.0)
-MIXTURE: OffsetLaw = "sometimes off-centre"
+MIXTURE: LawName = "sometimes off-centre"
 SPACING_MM = np.array([0.15, 0.12])
 LEFT_MM = 32.0
 """Pixel column 0 is so far to the left of the middle of the array: the image's corner."""

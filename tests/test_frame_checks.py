@@ -12,6 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import jaxcal
+from jaxcal import Problem
 from jaxcal.cli.common import ExitCode, exit_code
 from jaxcal.data.poses import inverse_poses
 from jaxcal.data.recording import make_images
@@ -44,7 +45,7 @@ def test_every_slip_is_named_or_refused_and_no_right_file_is(slips, form):
         for number in range(FILES):
             arrays = make(slips.recorded(number, form))
             try:
-                said = wrong_frames(arrays.images())
+                said = wrong_frames(Problem.from_recording(arrays.images()))
             except jaxcal.InputError as error:
                 said = str(error)
             if slip == "none" or (form, slip) in BY_SYMMETRY or (form, slip) == FREE_UNIT:
@@ -94,26 +95,26 @@ def test_noise_outliers_and_few_images_are_no_slips(slips):
             points[:: rng.integers(5, 9)] += rng.uniform(-30, 30, (1, 2))
         chosen = slice(0, int(rng.integers(4, 9))) if kind == 2 else slice(None)
         points[:, 1] = np.maximum(points[:, 1], 1.0)
-        assert wrong_frames(make_images(right.poses[chosen], points[chosen])) is None
+        assert wrong_frames(Problem.from_arrays(right.poses[chosen], points[chosen])) is None
 
 
 def test_points_of_other_images_do_not_fit_together(slips):
     right = slips.recorded(3, "mm")
     order = np.random.default_rng(4).permutation(len(right.points))
-    said = wrong_frames(make_images(right.poses, right.points[order]))
+    said = wrong_frames(Problem.from_arrays(right.poses, right.points[order]))
     assert said is not None
     assert "do not fit together" in said
 
 
 def test_a_wrong_spacing_is_told_with_the_right_one(slips):
     right = slips.recorded(5, "px, known")
-    said = wrong_frames(replace(right, spacing=(0.14, 0.12)).images())
+    said = wrong_frames(Problem.from_recording(replace(right, spacing=(0.14, 0.12)).images()))
     assert said is not None
     told = re.search(r"the pixels are ([0-9.]+) x ([0-9.]+) mm, not 0.14 x 0.12", said)
     assert told is not None
     np.testing.assert_allclose([float(told[1]), float(told[2])], slips.SPACING_MM, rtol=0.02)
     # Who estimates the scale does not believe the spacing.
-    data = jaxcal.Problem.from_recording(jaxcal.Recording(right.images()))
+    data = Problem.from_recording(right.images())
     wrong = replace(data, spacing=1.4 * data.spacing)
     assert wrong_frames(wrong) is not None
     assert wrong_frames(wrong, ("scale",)) is None
@@ -159,9 +160,9 @@ def test_the_real_recording_and_its_wrong_twins(real_data):
     images = read_crosswire(
         folder / "crossWirePhantomTransformations.txt", folder / "crossWirePhantom2DPoints.txt"
     ).calibration
-    assert wrong_frames(images) is None
+    assert wrong_frames(Problem.from_recording(images)) is None
     known = replace(images, spacing_mm=np.array([0.1478, 0.1398]))
-    assert wrong_frames(known) is None
+    assert wrong_frames(Problem.from_recording(known)) is None
     turned = images.poses.copy()
     turned[:, :3, :3] = np.swapaxes(turned[:, :3, :3], 1, 2)
     for wrong, words in (
@@ -170,6 +171,6 @@ def test_the_real_recording_and_its_wrong_twins(real_data):
         (replace(known, spacing_mm=np.array([1.478, 1.398])), "10 times too large"),
         (replace(known, poses=inverse_poses(images.poses)), "invert"),
     ):
-        said = wrong_frames(wrong)
+        said = wrong_frames(Problem.from_recording(wrong))
         assert said is not None
         assert words in said

@@ -290,6 +290,8 @@ def test_a_prior_of_the_medium_is_that_of_the_free_unknowns(drawn):
     for given in (-1.0, np.nan):
         with pytest.raises(InputError, match="delay_sd must be"):
             MediumPrior.of(problems, (*RIGID, "delay"), delay_sd=given)
+    with pytest.raises(TypeError, match="'speed_sd'"):
+        MediumPrior.of(problems, (*RIGID, "delay"), speed_sd=5.0)
     with pytest.raises(InputError, match="one leading axis"):
         MediumPrior.of(jax.tree.map(lambda leaf: leaf[0], problems), RIGID)
     np.testing.assert_array_equal(near.matrix()[1, :3, 3], near.translation[1])

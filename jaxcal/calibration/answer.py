@@ -33,14 +33,8 @@ from jaxcal.model.observations import (
     LocalUnknown,
     local_unknowns,
 )
-from jaxcal.model.parameters import Parameters
 from jaxcal.model.thresholds import LARGEST_ELEVATION, MINIMUM_SELF_TUNING
-from jaxcal.model.unknowns import (
-    Blocks,
-    block_slice,
-    count_unknowns,
-    with_prior,
-)
+from jaxcal.model.unknowns import Blocks, count_unknowns, split_further
 from jaxcal.result.calibration import Calibration, Linearisation, Medium, Status
 from jaxcal.solvers.convergence import Convergence
 from jaxcal.solvers.dense import inverse_batch_last
@@ -127,8 +121,11 @@ def assemble(
     if given.tracker_sd is not None and local is not None:
         elevation = mask * (errors.q[1] + given.tracker_sd * local)
         tracker_sd = jnp.broadcast_to(given.tracker_sd, used.shape)
+    prior_sd = None
+    if given.prior_sd is not None:
+        prior_sd = jnp.broadcast_to(given.prior_sd, (*used.shape, *given.prior_sd.shape))
     return Calibration(
-        image_to_probe=_matrix(parameters),
+        image_to_probe=parameters.matrix(),
         point=parameters.point,
         elevation=elevation,
         sigma=three_sigmas,
@@ -136,7 +133,9 @@ def assemble(
         channel_sigma=None if sigma is None or not plan.channels else sigma[..., 0],
         unknowns_covariance=covariance,
         scale_mm_per_px=problem.spacing * parameters.scale if problem.pixels else None,
-        medium=_medium(parameters, covariance, problem, given, plan),
+        medium=Medium.of(
+            split_further(iterate.further_values.T, blocks), covariance, blocks, problem, prior_sd
+        ),
         rms=jnp.sqrt(in_plane / used),
         mask=mask,
         status_code=status,
@@ -350,13 +349,6 @@ def _is_differentiable(
     return good & plan.options.differentiate
 
 
-def _matrix(parameters: Parameters) -> Float[Array, "*batch 4 4"]:
-    top = jnp.concatenate([parameters.rotation, parameters.translation[..., None]], axis=-1)
-    bottom = jnp.asarray([0.0, 0.0, 0.0, 1.0], top.dtype)
-    bottom = jnp.broadcast_to(bottom, (*top.shape[:-2], 1, 4))
-    return jnp.concatenate([top, bottom], axis=-2)
-
-
 def _residual_sds(
     errors: Errors, elevation: Float[Array, "*batch n"], blocks: Blocks, *, bounded: bool
 ) -> Float[Array, "*batch 3"]:
@@ -396,32 +388,3 @@ def _point_sd(errors: Errors, problem: Problem) -> Float[Array, "*batch 2"]:
     variance = jnp.stack([c, a], axis=-1) / jnp.where(known, determinant, 1.0)[..., None]
     known = (known & (mask > 0))[..., None]
     return jnp.sqrt(jnp.sum(jnp.where(known, variance, 0.0), axis=-2) / jnp.sum(known, axis=-2))
-
-
-def _medium(
-    parameters: Parameters,
-    covariance: Float[Array, "*batch p p"],
-    problem: Problem,
-    given: Given,
-    plan: SolvePlan,
-) -> Medium | None:
-    """Sound speed and delay in their units, with SDs; None where neither was estimated."""
-    blocks, speed = plan.blocks, problem.nominal_sound_speed
-    found: dict[str, Array | None] = {}
-    prior: dict[str, Array] = {}
-    if given.prior_sd is not None:
-        each = jnp.broadcast_to(given.prior_sd, (*speed.shape, *given.prior_sd.shape))
-        prior = dict(zip(with_prior(blocks), jnp.moveaxis(each, -1, 0), strict=True))
-    if "sound-speed" in blocks:
-        at = block_slice(blocks, "sound-speed").start
-        estimate = speed * parameters.sound_speed
-        found["sound_speed_m_s"] = estimate
-        found["sound_speed_sd_m_s"] = estimate * jnp.sqrt(covariance[..., at, at])
-        found["sound_speed_prior_m_s"] = prior.get("sound-speed")
-    if "delay" in blocks:
-        at = block_slice(blocks, "delay").start
-        before = 0.0 if problem.delay is None else problem.delay
-        found["delay_s"] = before + parameters.delay / (1e3 * speed)
-        found["delay_sd_s"] = jnp.sqrt(covariance[..., at, at]) / (1e3 * speed)
-        found["delay_prior_s"] = prior.get("delay")
-    return Medium(**found) if found else None

@@ -10,10 +10,9 @@ one pure function of arrays (:mod:`jaxcal.calibration.pipeline`).
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
-from functools import wraps
-from typing import Any, ParamSpec, get_args
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from typing import Any, get_args
 
 import numpy as np
 
@@ -36,7 +35,7 @@ from jaxcal.model.unknowns import (
 )
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import AnyArray, Array
-from jaxcal.runtime.arrays import array_module, is_traced
+from jaxcal.runtime.arrays import array_module, array_tree, is_traced, static
 from jaxcal.runtime.given_values import check_flag, whole_number
 from jaxcal.runtime.jax_modes import (
     importing_jax,
@@ -71,44 +70,27 @@ ALTERNATION = ("tolerance_rad", "tolerance_mm", "max_rounds", "inner_steps")
 LARGEST_CHUNK = 2**31 - 1
 """Largest ``chunk``: problems solved side by side."""
 
-P = ParamSpec("P")
 
-
-@dataclass(frozen=True)
+@array_tree
 class Request:
-    """A caller's request before any check; :func:`jaxcal.calibrate` documents each part."""
+    """A caller's request before any check; :func:`jaxcal.calibrate` documents each part.
 
-    method: Method = "joint"
-    prior: PriorName = "auto"
+    It is a tree so that JAX finds the numbers that are traced.
+    """
+
+    method: Method = static(default="joint")
+    prior: PriorName = static(default="auto")
     max_elevation: float | np.ndarray | Array | None = None
     sigma: Sequence[float] | np.ndarray | Array | None = None
     tracker_sd: float | Array | None = None
-    estimate: tuple[str, ...] = ()
-    data: Data = "auto"
+    estimate: tuple[str, ...] = static(default=())
+    data: Data = static(default="auto")
     sound_speed_sd: float | Array = SOUND_SPEED_SD_M_S
     delay_sd: float | Array = DELAY_SD_S
-    options: Options | None = None
-    robust: bool = False
+    options: Options | None = static(default=None)
+    robust: bool = static(default=False)
 
 
-def _taking_recordings(function: Callable[P, Calibration]) -> Callable[P, Calibration]:
-    """Decorate :func:`calibrate`: it takes recordings as well, and the answer knows their probe.
-
-    Placed outside ``in_own_modes``: to segment times of flight imports JAX, and what imports JAX
-    within would run in the caller's modes.
-    """
-
-    @wraps(function)
-    def taking(problem: Problem | Recording | Images, *args: Any, **kwargs: Any) -> Calibration:
-        found = function(as_problem(problem, "jaxcal.calibrate"), *args, **kwargs)  # pyright: ignore[reportCallIssue]
-        probe = problem.probe if isinstance(problem, Recording) else None
-        return found if probe is None else replace(found, probe=probe)
-
-    return taking  # pyright: ignore[reportReturnType]
-
-
-@_taking_recordings
-@in_own_modes
 def calibrate(
     problem: Problem | Recording | Images,
     method: Method = "joint",
@@ -178,7 +160,6 @@ def calibrate(
             checked, and such problems get the status ``failed``. Also where an alternation is
             differentiated that stops before the minimum.
     """
-    assert isinstance(problem, Problem)  # converted
     request = Request(
         method,
         prior,
@@ -192,6 +173,15 @@ def calibrate(
         options,
         robust,
     )
+    # Not in own modes: segmenting times of flight imports JAX, whose modes are entered after that.
+    found = _calibrated(as_problem(problem, "jaxcal.calibrate"), request)
+    probe = problem.probe if isinstance(problem, Recording) else None
+    return found if probe is None else replace(found, probe=probe)
+
+
+@in_own_modes
+def _calibrated(problem: Problem, request: Request) -> Calibration:
+    """:func:`calibrate` in the modes of JAX that jaxcal computes in."""
     problem, plan, given = prepare(problem, request)
     if problem.batch_shape:
         from jaxcal.calibration.engine import solve_batch
@@ -360,8 +350,8 @@ def prepare(
     blocks = RIGID + tuple(name for name in FURTHER if name in request.estimate)
     prior_sd = None
     if kind == "gaussian" and with_prior(blocks):
-        asked = {"sound-speed": request.sound_speed_sd, "delay": request.delay_sd}
-        believed = [array(asked.get(name, TABLE[name].prior_sd)) for name in with_prior(blocks)]
+        rows = [TABLE[name] for name in with_prior(blocks)]
+        believed = [array(getattr(request, row.prior_name, row.prior_sd)) for row in rows]
         prior_sd = array_module(believed).stack(believed)
     given = Given(array(request.sigma), array(request.tracker_sd), prior_sd)
     components = 2 if channels else 3
@@ -402,16 +392,16 @@ def check_request(request: Request) -> Prior:
         prior = "bounded"
     _check_combination(request, prior)
     tiny = np.finfo(float).tiny
-    for name, least, one in (
-        ("sound_speed_sd", tiny, True),
-        ("delay_sd", tiny, True),
-        ("tracker_sd", 0.0, True),
-        ("sigma", tiny, False),
-        ("max_elevation", 0.0, False),
+    priors = [(TABLE[name].prior_name, tiny, True, TABLE[name].prior_unit) for name in MEDIUM]
+    for name, least, one, unit in (
+        *priors,
+        ("tracker_sd", 0.0, True, "mm"),
+        ("sigma", tiny, False, "mm"),
+        ("max_elevation", 0.0, False, "mm"),
     ):
         value = getattr(request, name)
         if value is not getattr(Request, name):  # the default
-            check_size(name, value, least, one=one)
+            check_size(name, value, least, one=one, unit=unit)
     return prior
 
 
@@ -432,7 +422,8 @@ def _check_combination(request: Request, kind: Prior) -> None:
         raise InputError(f"the prior {request.prior} does not go with the method {request.method}")
     if kind != "gaussian" and (request.sigma is not None or request.tracker_sd is not None):
         raise InputError("sigma and tracker_sd belong to the joint method's gaussian prior")
-    for name, unknown in zip(("sound_speed_sd", "delay_sd"), MEDIUM, strict=True):
+    for unknown in MEDIUM:
+        name = TABLE[unknown].prior_name
         if getattr(request, name) is getattr(Request, name):  # the default
             continue
         if kind != "gaussian" or unknown not in request.estimate:

@@ -17,11 +17,10 @@ from dataclasses import replace
 import numpy as np
 
 from jaxcal.data.problem import Problem
-from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns
+from jaxcal.diagnostics.image_errors import ImageErrors
 from jaxcal.diagnostics.uncertainty import LARGEST_SD, inverses, mm_at_target, threshold
-from jaxcal.model.unknowns import FURTHER, block_slice, count_unknowns
+from jaxcal.model.unknowns import FURTHER, count_unknowns, split_further
 from jaxcal.result.calibration import Calibration, Linearisation, Medium, Status
-from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.arrays import map_arrays
 from jaxcal.solvers.closed_form.reduced_objective import CONSTRAINTS
 from jaxcal.solvers.closed_form.single import ClosedForm, solve_problem
@@ -57,8 +56,7 @@ def closed_form_answer(problem: Problem, plan: SolvePlan) -> Calibration | None:
 def _with_uncertainty(found: ClosedForm, problem: Problem, plan: SolvePlan) -> Calibration | None:
     """The closed form as a calibration without its problem; None where poses are degenerate."""
     blocks, eps = plan.blocks, float(np.finfo(float).eps)
-    unknowns = Unknowns.of_closed_form(found, problem)
-    seen = ImageErrors.of(unknowns, map_arrays(lambda a: a[None], problem), blocks)
+    seen = ImageErrors.of_closed_form(found, problem, blocks)
     plane = np.zeros_like(seen.mask)
     residual, axial = seen.from_circle(plane)
     rows = seen.circle_rows(axial).reshape(-1, count_unknowns(blocks))
@@ -81,8 +79,8 @@ def _with_uncertainty(found: ClosedForm, problem: Problem, plan: SolvePlan) -> C
     if weak:
         covariance = np.full_like(covariance, np.nan)
 
-    parts = [unknowns.further[name] for name in FURTHER if name in blocks]
-    further = [part[0] for block in parts for part in block]
+    parts = [seen.unknowns.further[name] for name in FURTHER if name in blocks]
+    further = np.array([part[0] for block in parts for part in block])
     gradient = np.abs(errors @ rows)
     length = np.sqrt(np.diag(information) * objective)
     # With exact data the errors are only rounding, and their gradient means nothing.
@@ -105,7 +103,7 @@ def _with_uncertainty(found: ClosedForm, problem: Problem, plan: SolvePlan) -> C
         channel_sigma=None,
         unknowns_covariance=covariance,
         scale_mm_per_px=found.scale_mm_per_px,
-        medium=_medium(found, covariance, problem, plan),
+        medium=Medium.of(split_further(further, blocks), covariance, blocks, problem),
         rms=np.asarray(np.sqrt(objective / used)),
         mask=np.asarray(problem.mask, float),
         status_code=np.asarray(status, np.int32),
@@ -129,7 +127,7 @@ def _with_uncertainty(found: ClosedForm, problem: Problem, plan: SolvePlan) -> C
             variance=np.asarray(variance),
             tracker_sd=None,
             average_elevation_sd=None,
-            further=np.array(further) if further else None,
+            further=further if len(further) else None,
         ),
         problem=None,
         method=plan.method,
@@ -137,18 +135,4 @@ def _with_uncertainty(found: ClosedForm, problem: Problem, plan: SolvePlan) -> C
         data="points",
         blocks=blocks,
         robust=False,
-    )
-
-
-def _medium(
-    found: ClosedForm, covariance: Float[np.ndarray, "p p"], problem: Problem, plan: SolvePlan
-) -> Medium | None:
-    """The sound speed, where it was estimated."""
-    if "sound-speed" not in plan.blocks:
-        return None
-    speed = float(problem.nominal_sound_speed) * found.sound_speed_factor
-    at = block_slice(plan.blocks, "sound-speed").start
-    return Medium(
-        sound_speed_m_s=np.asarray(speed),
-        sound_speed_sd_m_s=np.asarray(speed * np.sqrt(covariance[at, at])),
     )

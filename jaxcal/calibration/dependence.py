@@ -31,23 +31,21 @@ section 3 (integrated autocorrelation time); Liang and Zeger 1986 (clustered dat
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.data.poses import nearest_rotations, targets_in_images
+from jaxcal.data.poses import nearest_rotations
+from jaxcal.data.problem import Problem
 from jaxcal.data.recording import MINIMUM_IMAGES
+from jaxcal.diagnostics.image_errors import ImageErrors
 from jaxcal.model.thresholds import MAD
+from jaxcal.model.unknowns import RIGID
 from jaxcal.runtime.array_types import Bool, Float, Int
 from jaxcal.runtime.arrays import like
-from jaxcal.solvers.closed_form.reduced_objective import knows_spacing
-from jaxcal.solvers.closed_form.single import ClosedForm, solve_problem
-
-if TYPE_CHECKING:
-    from jaxcal.data.problem import Problem
-    from jaxcal.data.recording import Images
+from jaxcal.solvers.closed_form.single import solve_problem
 
 SAME_POSE_MM = 1.0
 """Two poses are the same if no point within the lever moves farther than this between them."""
@@ -139,24 +137,26 @@ class IndependentImages:
         return told
 
 
-def independent(data: Any, estimate: tuple[str, ...] = ()) -> tuple[Any, IndependentImages]:
+def independent(
+    problem: Problem, estimate: tuple[str, ...] = ()
+) -> tuple[Problem, IndependentImages]:
     """Let every pose count once.
 
     Args:
-        data: one problem with concrete values, or one set of images with points.
-        estimate: what the calibration will estimate; the fits in this module estimate the pixel
+        problem: one problem with concrete values.
+        estimate: what the calibration will estimate; the fit in this module estimates the pixel
             size or the sound speed where it does, and a pixel size that is not known.
 
     Returns:
-        The data, and which images are independent. The data have the same shape: one image of every
-        group has the group's mean pose and point, and the others are masked out. Where all images
-        are independent, the data are the same object.
+        The problem, and which images are independent. The problem has the same shape: one image of
+        every group has the group's mean pose and point, and the others are masked out. Where all
+        images are independent, it is the same object.
 
     Raises:
         InputError: fewer than 4 different poses.
     """
-    poses, mask = np.asarray(data.poses, dtype=float), np.asarray(data.mask) > 0
-    frozen = _frozen(poses, np.asarray(data.measurements, dtype=float), mask)
+    poses, mask = np.asarray(problem.poses, dtype=float), np.asarray(problem.mask) > 0
+    frozen = _frozen(poses, np.asarray(problem.measurements, dtype=float), mask)
     mask = mask & ~frozen
     group = same_pose(poses, mask)
     found = replace(_representatives(group, mask), frozen=tuple(np.flatnonzero(frozen).tolist()))
@@ -168,19 +168,19 @@ def independent(data: Any, estimate: tuple[str, ...] = ()) -> tuple[Any, Indepen
             f"than {SAME_POSE_MM:g} mm count once)"
         )
     if found.frozen:
-        data = _with_arrays(data, {"mask": mask})
+        problem = _with_arrays(problem, {"mask": mask})
     if found.poses < found.frames:
-        data = _with_group_averages(data, found)
+        problem = _with_group_averages(problem, found)
     if found.images >= SHORTEST_STREAM:
-        stride = _stride(data, estimate)
+        stride = _stride(problem, estimate)
         if stride > 1:
             left = np.flatnonzero(found.keep)
             keep = np.zeros_like(found.keep)
             # Keep the middle of every piece.
             keep[left[stride // 2 :: stride]] = True
             found = replace(found, keep=keep, stride=stride)
-            data = _with_arrays(data, {"mask": keep})
-    return data, found
+            problem = _with_arrays(problem, {"mask": keep})
+    return problem, found
 
 
 def same_pose(
@@ -353,71 +353,48 @@ def _representatives(
     return IndependentImages(group, keep, frames=len(used), poses=len(starts))
 
 
-_AVERAGED = ("measurements", "covariance", "max_elevation", "amplitude", "time", "time_of_flight")
-"""Arrays of images or problems that are averaged over a group."""
-
-
-def _with_group_averages(data: Any, found: IndependentImages) -> Any:
-    """The data with one image for every group, at the index of the image that is kept."""
-    values: dict[str, Any] = {"poses": np.array(data.poses)}
-    names = {field.name for field in fields(data)}
-    for name in _AVERAGED:
-        if name in names and getattr(data, name) is not None:
-            values[name] = np.array(getattr(data, name))
-    channels = getattr(data, "channels", None)
+def _with_group_averages(problem: Problem, found: IndependentImages) -> Problem:
+    """The problem with one image for every group, at the index of the image that is kept."""
+    names, channels = ("poses", "measurements", "covariance", "max_elevation"), problem.channels
+    given = {name: getattr(problem, name) for name in names}
+    before = {name: np.asarray(each) for name, each in given.items() if each is not None}
     if channels is not None:
-        values["distances"] = np.array(channels.distances)
-        values["heard"] = np.array(channels.heard)
-    before = {name: each.copy() for name, each in values.items()}
+        before["distances"] = np.asarray(channels.distances)
+        before["heard"] = np.asarray(channels.heard)
+    after = {name: each.copy() for name, each in before.items()}
     used = np.flatnonzero(found.group >= 0)
     for rows in map(used.__getitem__, _members(found.group[used])):
         kept = rows[found.keep[rows]][0]
-        pose = before["poses"][rows].mean(axis=0)
+        for name, values in before.items():
+            after[name][kept] = values[rows].mean(axis=0)
+        pose = after["poses"][kept]
         pose[:3, :3] = nearest_rotations(pose[None, :3, :3])[0][0]
-        values["poses"][kept] = pose
-        for name in _AVERAGED:
-            if name in values:
-                values[name][kept] = _group_average(before[name][rows], name)
+        if len(rows) >= MEDIAN_FROM:
+            after["measurements"][kept] = np.median(before["measurements"][rows], axis=0)
         if channels is not None:
             weight = before["heard"][rows]
             total = weight.sum(axis=0)
             sums = (weight * np.where(weight > 0, before["distances"][rows], 0.0)).sum(axis=0)
-            values["distances"][kept] = sums / np.where(total > 0, total, 1.0)
-            values["heard"][kept] = total >= 0.5 * len(rows)
+            after["distances"][kept] = sums / np.where(total > 0, total, 1.0)
+            after["heard"][kept] = total >= 0.5 * len(rows)
     if channels is not None:
-        heard = {name: values.pop(name) for name in ("distances", "heard")}
-        values["channels"] = _with_arrays(channels, heard)
-    return _with_arrays(data, {"mask": found.keep, **values})
+        heard = {name: after.pop(name) for name in ("distances", "heard")}
+        problem = replace(problem, channels=_with_arrays(channels, heard))
+    return _with_arrays(problem, {"mask": found.keep, **after})
 
 
-def _with_arrays(data: Any, values: dict[str, Any]) -> Any:
+def _with_arrays(data: Any, values: dict[str, np.ndarray]) -> Any:
     """The data with other arrays; each is a numpy or JAX array like the one that it replaces."""
-    return replace(
-        data,
-        **{
-            name: like(getattr(data, name), value) if isinstance(value, np.ndarray) else value
-            for name, value in values.items()
-        },
-    )
+    changed = {name: like(getattr(data, name), value) for name, value in values.items()}
+    return replace(data, **changed)
 
 
-def _group_average(values: np.ndarray, name: str) -> Any:
-    """The value for a group, from its frames' values of the array with this name."""
-    if name == "time_of_flight":
-        heard = np.isfinite(values).mean(axis=0) >= 0.5
-        total = np.nansum(values, axis=0) / np.maximum(np.isfinite(values).sum(axis=0), 1)
-        return np.where(heard, total, np.nan)
-    if name == "measurements" and len(values) >= MEDIAN_FROM:
-        return np.median(values, axis=0)
-    return values.mean(axis=0)
-
-
-def _stride(data: Images | Problem, estimate: tuple[str, ...]) -> int:
+def _stride(problem: Problem, estimate: tuple[str, ...]) -> int:
     """The number t for which every t-th image of a stream is kept; 1 for other recordings."""
-    if not _moves_continuously(np.asarray(data.poses, float)[np.asarray(data.mask) > 0]):
+    if not _moves_continuously(np.asarray(problem.poses, float)[np.asarray(problem.mask) > 0]):
         # Errors that are alike for long are then no stream's: a mount has slipped, say.
         return 1
-    errors = conventional_errors(data, estimate)
+    errors = _conventional_errors(problem, estimate)
     if errors is None:
         return 1
     time = 1.0
@@ -473,36 +450,18 @@ def correlation_time(correlation: Float[np.ndarray, " n"]) -> float:
     return float(time / max(1 - ABSORBED_ERRORS * time / len(correlation), LEAST_SHARE_LEFT))
 
 
-def conventional_errors(
-    data: Images | Problem, estimate: tuple[str, ...] = ()
+def _conventional_errors(
+    problem: Problem, estimate: tuple[str, ...]
 ) -> Float[np.ndarray, "m 3"] | None:
-    """Lateral, range and elevational errors (mm) of the used images, in their order.
+    """Errors of the used images under the conventional fit in closed form, in their order, mm.
 
-    Args:
-        data: one problem with concrete values, or images with points.
-        estimate: what the calibration estimates.
-
-    Returns:
-        The errors of the conventional fit in closed form; None where there is no such fit.
+    They are along the image's lateral, elevational and axial axes. None where there is no such fit.
     """
     free = tuple(name for name in ("scale", "sound-speed") if name in estimate)
-    if not knows_spacing(data):
-        free = ("scale",)
     try:
-        found = solve_problem(data, free)
+        found = solve_problem(problem, free if problem.spacing_known else ("scale",))
     except InputError:
         return None
-    return _errors(found, data)
-
-
-def _errors(found: ClosedForm, data: Any) -> Float[np.ndarray, "m 3"]:
-    """Lateral, range and elevational errors of the used images under a conventional fit, mm."""
-    used = np.asarray(data.mask) > 0
-    poses = np.asarray(data.poses, dtype=float)[used]
-    points = np.asarray(data.measurements, dtype=float)[used]
-    if found.scale_mm_per_px is not None:
-        points = points * found.scale_mm_per_px
-    face = float(getattr(data, "face_offset_mm", getattr(data, "face_offset", 0.0)))
-    distance = float(found.sound_speed_factor) * (points[:, 1] + face)
-    q = targets_in_images(poses, found.image_to_probe, found.point_mm)
-    return np.stack([q[:, 0] - points[:, 0], q[:, 2] - distance, q[:, 1]], axis=1)
+    seen = ImageErrors.of_closed_form(found, problem, RIGID)
+    in_plane, _ = seen.from_circle(np.zeros_like(seen.mask))
+    return in_plane[seen.mask > 0]

@@ -1,10 +1,9 @@
-"""What solves a problem or a batch by the engine: a kept program on a CPU, else one of JAX's own.
+"""Solves a problem or a batch by a compiled program of :mod:`jaxcal.calibration.pipeline`.
 
-On a CPU, machine code is kept between processes (:mod:`jaxcal.runtime.executables`) in sizes that
-serve many problems; a program that is found there is neither imported, traced nor compiled. So one
-problem is solved on a CPU, unless its arrays were put elsewhere. On other devices, inside
-somebody's jit, vmap or grad, and with a solver of the caller's own, JAX compiles
-:mod:`jaxcal.calibration.pipeline` as it compiles anything.
+On a CPU, machine code is kept between processes (:mod:`jaxcal.runtime.executables`), in sizes that
+serve many problems. If a program is kept, the pipeline is neither imported, traced nor compiled. So
+one problem is solved on a CPU, unless its arrays were put elsewhere. On other devices, inside
+somebody's jit, vmap or grad, and with a solver of the caller's own, JAX compiles the pipeline.
 """
 
 from __future__ import annotations
@@ -13,6 +12,8 @@ from dataclasses import fields, replace
 from functools import partial
 from typing import Any, TypeVar
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxcal import InputError
@@ -47,14 +48,14 @@ FEW_PROBLEMS = 1024
 
 @in_own_modes
 def solve_problem(problem: Problem, given: Given, plan: SolvePlan) -> Calibration:
-    """One problem, but for the problem itself in the result (traceable)."""
+    """Solve one problem; the result does not hold the problem (traceable)."""
     if _is_kept(problem, plan, inside=inside_transformation(problem, given)):
         return _solve_kept(problem, given, plan)
     return _solve_compiled(problem, given, plan)
 
 
 def _solve_compiled(problem: Problem, given: Given, plan: SolvePlan) -> Calibration:
-    """One problem by a program of JAX's own, which serves every method and prior."""
+    """Solve one problem by a program that JAX compiles."""
     from jaxcal.calibration.pipeline import agreed_images, solve_one
 
     platform = None
@@ -68,7 +69,7 @@ def _solve_compiled(problem: Problem, given: Given, plan: SolvePlan) -> Calibrat
 
 
 def _solve_kept(problem: Problem, given: Given, plan: SolvePlan) -> Calibration:
-    """One problem by programs that are kept, which serve many numbers of images."""
+    """Solve one problem by kept programs, which serve several numbers of images."""
     padded = fill_up(problem, padded_images(problem.images))
     run = partial(executables.run, flags=compiler.ONE_PROBLEM)
     label = _label(plan, padded.images)
@@ -87,7 +88,7 @@ def _solve_kept(problem: Problem, given: Given, plan: SolvePlan) -> Calibration:
 
 
 def fill_up(problem: Problem, images: int) -> Problem:
-    """A problem or batch with masked images up to that number; numpy arrays if it grows."""
+    """A problem or batch padded with masked images to a number; in numpy arrays if it is padded."""
     more = images - problem.images
     if not more:
         return problem
@@ -101,7 +102,14 @@ def fill_up(problem: Problem, images: int) -> Problem:
 
 @in_own_modes
 def solve_batch(problems: Problem, given: Given, plan: SolvePlan, chunk: int | None) -> Calibration:
-    """A batch with its problems in the result (traceable); by default the chunk is for its kind."""
+    """Solve a batch; the result holds its problems (traceable).
+
+    Args:
+        problems: with any leading axes.
+        given: numbers that came with the request.
+        plan: what is static about it.
+        chunk: number of problems solved side by side; None: what suits the data and the device.
+    """
     shape = problems.batch_shape
     flat = problems
     if len(shape) > 1:
@@ -122,9 +130,7 @@ def solve_batch(problems: Problem, given: Given, plan: SolvePlan, chunk: int | N
 
 
 def _side_by_side(problems: Problem, plan: SolvePlan, *, inside: bool) -> int:
-    """How many problems are solved at once, unless the caller says."""
-    import jax
-
+    """Number of problems that are solved side by side by default."""
     platform = jax.default_backend() if inside else _devices(problems)[0].platform
     if platform == "cpu":
         if plan.channels:
@@ -139,18 +145,18 @@ def _side_by_side(problems: Problem, plan: SolvePlan, *, inside: bool) -> int:
 def _solve_chunks_kept(
     problems: Problem, given: Given, plan: SolvePlan, largest: int, last: bool
 ) -> tuple[Calibration, bool]:
-    """A batch (one leading axis) by a program that serves all batches of nearly its size.
+    """Solve a batch (one leading axis) by a kept program, which serves batches of nearly its size.
 
     Args:
         problems: the batch.
         given: numbers that came with the request.
         plan: what is static about it.
         largest: most problems solved side by side.
-        last: nothing is done to the result afterwards.
+        last: the caller does nothing to the result afterwards.
 
     Returns:
-        The result in JAX's arrays and True, if it is the last and was not padded. Else in numpy
-        arrays, which may go on behind the last problem, and False.
+        The result and True: finished, in JAX arrays, if the caller does nothing to it and the batch
+        needed no padding. Else the result in numpy arrays, padding included, and False.
     """
     count, images = problems.mask.shape
     chunk = min(bucket(count), largest)
@@ -180,10 +186,10 @@ def _solve_chunks_kept(
 def _solve_chunks_compiled(
     problems: Problem, given: Given, plan: SolvePlan, largest: int
 ) -> Calibration:
-    """A batch (one leading axis) by JAX's own program, on all devices where it may go anywhere."""
-    import jax
-    import jax.numpy as jnp
+    """Solve a batch (one leading axis) by a program that JAX compiles.
 
+    If its arrays are not committed to a device, all of the local devices share it.
+    """
     from jaxcal.calibration import pipeline
 
     count = problems.mask.shape[0]
@@ -214,17 +220,15 @@ def _label(plan: SolvePlan, images: int) -> dict[str, Any]:
 
 
 def _is_kept(problems: Problem, plan: SolvePlan, *, inside: bool) -> bool:
-    """Whether the program for it is one that is kept: whole, on one CPU, and of our own solvers.
+    """Whether a kept program solves it: on one CPU, and by our own solvers.
 
     Args:
         problems: one or many.
         plan: what is static about the request.
-        inside: a jit, vmap or grad of the caller's looks at the code.
+        inside: this is inside a jit, vmap or grad of the caller's.
     """
     if inside or not executables.is_describable(plan):
         return False
-    import jax
-
     interpreted = jax.config.jax_disable_jit  # pyright: ignore[reportAttributeAccessIssue]
     devices = _devices(problems)
     if not problems.batch_shape:
@@ -233,32 +237,24 @@ def _is_kept(problems: Problem, plan: SolvePlan, *, inside: bool) -> bool:
 
 
 def as_jax_holds(arrays: T, problem: Problem) -> T:
-    """JAX's arrays, where the problem's are."""
-    import jax
-
+    """JAX arrays on the device of the problem's."""
     return jax.device_put(arrays, next(iter(_held(problem)), None))
 
 
 def _kept_as_jax_holds(arrays: list[Any], problem: Problem) -> list[Any]:
-    """A program's arrays where the problem's are; they lie on the program's device."""
-    import jax
-
+    """A program's arrays, moved from its device to that of the problem's."""
     if len(jax.devices()) == 1 and jax.default_backend() == "cpu":
         return arrays  # there is no other place
     return as_jax_holds(executables.in_numpy(arrays), problem)
 
 
 def _devices(problems: Problem) -> tuple[Any, ...]:
-    """The devices that hold a problem's arrays, or all local ones where they may go anywhere."""
-    import jax
-
+    """The devices that hold a problem's arrays; all local ones if these are not committed."""
     return _held(problems) or tuple(jax.local_devices())
 
 
 def _held(problems: Problem) -> tuple[Any, ...]:
-    """The devices that hold a problem's arrays; none where they may go anywhere."""
-    import jax
-
+    """The devices that hold a problem's arrays; none if these are not committed to a device."""
     leaves = [leaf for leaf in jax.tree.leaves(problems) if isinstance(leaf, jax.Array)]
     held = {frozenset(leaf.devices()) for leaf in leaves if leaf.committed}
     if len(held) > 1:

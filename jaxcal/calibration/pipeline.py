@@ -61,7 +61,7 @@ def solve_problems(
             seen = jax.lax.stop_gradient(problems.points_only())
             agreed = jax.vmap(jax.custom_batching.sequential_vmap(search))(seen)
         problems = replace(problems, mask=agreed)
-    # What is neither used nor left out must not count as something between: its problem fails.
+    # Where a mask holds anything but 0 and 1, the problem fails.
     problems = replace(problems, mask=jnp.where(is_mask, problems.mask, jnp.nan))
     if not plan.one_by_one:
         return _solved(problems, given, plan, begun)

@@ -35,7 +35,7 @@ from jaxcal.data.problem import Problem, as_problem
 from jaxcal.data.recording import MINIMUM_IMAGES, Images, Recording
 from jaxcal.diagnostics.image_errors import noise_covariance
 from jaxcal.diagnostics.intervals import range_of_row_zero
-from jaxcal.diagnostics.metrics import calibration_reproducibility
+from jaxcal.diagnostics.metrics import calibration_reproducibility, reconstruct
 from jaxcal.model.thresholds import MAD
 from jaxcal.model.unknowns import Values, measured, split_further, unknown_names
 from jaxcal.result.calibration import Calibration
@@ -463,8 +463,7 @@ def _with_rows(problem: Problem, rows: AnyArray, mask: Float[AnyArray, "k n"]) -
 
 def _unknowns(result: Calibration) -> tuple[Any, Any, Any, Values]:
     """Rotation and translation of X, the target, and the free further unknowns by name."""
-    x, further = result.image_to_probe, result.linearisation.further
-    values = {} if further is None else split_further(further, result.blocks)
+    x, values = result.image_to_probe, split_further(result.linearisation.further, result.blocks)
     return x[..., :3, :3], x[..., :3, 3], result.point, values
 
 
@@ -489,9 +488,8 @@ def _held_out_errors(
     q = back(rotation, back(turned, target - origin) - translation)
     far = xp.hypot(q[:, 1], q[:, 2])
     errors = xp.stack([q[:, 0] - lateral, far - distance, q[:, 1]], axis=1)
-    in_image = xp.stack([lateral, xp.zeros_like(lateral), distance], axis=1)
-    in_probe = xp.einsum("nij,nj->ni", rotation, in_image) + translation
-    there = xp.einsum("nij,nj->ni", turned, in_probe) + origin
+    in_plane = xp.stack([lateral, distance], axis=1)
+    there = reconstruct(held.image_to_probe, problem.poses, in_plane)
     return problem.mask[:, None] * errors, problem.mask[:, None] * (there - target)
 
 

@@ -22,7 +22,7 @@ from jaxcal.cli.common import (
     segmented,
 )
 from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
-from jaxcal.study.laws import OFFSET_LAWS, OffsetLaw
+from jaxcal.study.laws import OFFSET_LAWS, LawName
 
 if TYPE_CHECKING:
     from jaxcal.design import Candidates, Plan
@@ -137,7 +137,7 @@ def plan(
     sigma: tuple[float, float, float] | None,
     estimate: str | None,
     seed: int,
-    simulate: tuple[OffsetLaw, ...],
+    simulate: tuple[LawName, ...],
     figure: str | None,
     as_json: bool,
 ) -> int:

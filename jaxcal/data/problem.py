@@ -340,18 +340,21 @@ def _lengthened(problem: Problem, images: int) -> Problem:
     return replace(longer, mask=longer.mask * (~added).astype(longer.mask.dtype))
 
 
-def as_problem(value: Any, name: str) -> Problem:
+def as_problem(value: Any, name: str, *, channels: bool = True) -> Problem:
     """The problem that a caller gave; recordings and images are converted.
 
     Args:
         value: a problem, a recording or one set of images.
         name: of the function that was called, for messages.
+        channels: False if points are enough: times of flight beside points are not read.
 
     Raises:
         InputError: anything else, with what to do.
     """
     if isinstance(value, Problem):
         return value
+    if not channels and isinstance(value, Recording):
+        value = value if value.calibration.kind == "time_of_flight" else value.calibration
     if isinstance(value, Recording | Images):
         return Problem.from_recording(value)
     if isinstance(value, str | os.PathLike):
@@ -368,8 +371,10 @@ def as_problem(value: Any, name: str) -> Problem:
     raise InputError(f"{name} takes a problem or a recording, not {kind}: {_HOW}")
 
 
-def as_batch(value: Any, name: str) -> Problem:
+def as_batch(value: Any, name: str, *, channels: bool = True) -> Problem:
     """The batch of problems that a caller gave; a list of problems or recordings is stacked.
+
+    Arguments are those of :func:`as_problem`.
 
     Raises:
         InputError: anything else, or problems that differ in what they hold.
@@ -377,8 +382,8 @@ def as_batch(value: Any, name: str) -> Problem:
     if isinstance(value, list | tuple):
         if not value:
             raise InputError(f"{name} takes at least one problem; the list is empty")
-        return stack([as_problem(each, name) for each in value])
-    return as_problem(value, name)
+        return stack([as_problem(each, name, channels=channels) for each in value])
+    return as_problem(value, name, channels=channels)
 
 
 def check_shapes(problem: Problem) -> None:

@@ -23,7 +23,7 @@ from jaxcal import InputError
 from jaxcal.data.poses import check_poses, targets_in_images
 from jaxcal.design.noise import Noise, check_result, used_images
 from jaxcal.diagnostics.image_errors import motion
-from jaxcal.model.unknowns import RIGID, block_slice
+from jaxcal.model.unknowns import RIGID, TABLE, block_slice, count_unknowns
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.arrays import is_traced
 from jaxcal.runtime.given_values import check_flag, check_made, is_number, real_array
@@ -31,7 +31,7 @@ from jaxcal.runtime.given_values import check_flag, check_made, is_number, real_
 if TYPE_CHECKING:
     from jaxcal.result.calibration import Calibration
 
-BELIEVED_SD = (50.0, 0.5, 50.0, 0.3)
+BELIEVED_SD = {"translation": 50.0, "rotation": 0.5, "point": 50.0, "scale": 0.3}
 """Prior SDs before any image (our choice): of X's translation (mm) and rotation (rad), of the
 target (mm) and of a pixel scale's logarithm. This prior is weak: five images tell more."""
 
@@ -94,8 +94,8 @@ class Model:
 
     @property
     def size(self) -> int:
-        """Number of unknowns p: 9, or 11 with scales."""
-        return 11 if self.scale else 9
+        """Number of unknowns p."""
+        return count_unknowns(self.blocks)
 
     @property
     def blocks(self) -> tuple[str, ...]:
@@ -126,8 +126,8 @@ class Model:
 
     def beliefs(self) -> Float[np.ndarray, "p p"]:
         """Information before any image (:data:`BELIEVED_SD`)."""
-        sd = np.repeat(BELIEVED_SD, (3, 3, 3, 2))[: self.size]
-        return np.diag(1.0 / sd**2)
+        sd = [BELIEVED_SD[name] for name in self.blocks for _ in TABLE[name].tangents]
+        return np.diag(1.0 / np.square(sd))
 
 
 def covariance_of(information: Float[np.ndarray, "*k p p"]) -> Float[np.ndarray, "*k p p"]:

@@ -35,6 +35,7 @@ from jaxcal.design.information import (
 )
 from jaxcal.design.noise import SD_RANGE_MM, Noise, check_result
 from jaxcal.diagnostics.directions import direction_in_words
+from jaxcal.diagnostics.uncertainty import mm_at_target
 from jaxcal.runtime.array_types import Bool, Float
 from jaxcal.runtime.given_values import check_flag, check_made, real_array, whole_number
 
@@ -312,8 +313,8 @@ def check_candidates(candidates: Candidates) -> None:
         raise InputError(
             f"the noise model's SDs must be {low:g} to {high:g} mm at all candidate poses"
         )
-    lever = float(np.sqrt(np.mean(np.sum(model.targets(every) ** 2, axis=1))))
-    scale = np.repeat([1.0, lever, 1.0, lever], (3, 3, 3, 2))[: model.size]
+    lever = np.sqrt(np.mean(np.sum(model.targets(every) ** 2, axis=1)))
+    scale = mm_at_target(np.asarray(lever), model.blocks)
     found = model.information(every) / (scale[:, None] * scale)
     values, vectors = np.linalg.eigh(found)
     if values[0] > _SINGULAR * values[-1]:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from jaxcal.data.problem import Problem
     from jaxcal.design.information import Model
     from jaxcal.solvers.names import Method, PriorName
-    from jaxcal.study.laws import OffsetLaw
+    from jaxcal.study.laws import LawName
 
 MOST_TRIALS = 100_000
 """Of one call; they are all in memory at once."""
@@ -50,7 +50,7 @@ class SimulatedErrors:
         lost: trials without an answer, which are in none of these numbers.
     """
 
-    law: OffsetLaw
+    law: LawName
     images: int
     trials: int
     tre_mm: float
@@ -65,7 +65,7 @@ class SimulatedErrors:
 @in_own_modes
 def simulate_errors(
     poses: Plan | Float[np.ndarray, "*trials n 4 4"],
-    law: OffsetLaw = "uniform",
+    law: LawName = "uniform",
     candidates: Candidates | None = None,
     *,
     method: Method = "joint",
@@ -155,7 +155,7 @@ def _with_taken(plan: Plan) -> Float[np.ndarray, "n 4 4"]:
 def _recordings(
     poses: Float[np.ndarray, "trials n 4 4"],
     model: Model,
-    law: OffsetLaw,
+    law: LawName,
     rng: np.random.Generator,
 ) -> Problem:
     """Problems whose poses are off along the elevational axis, with erring measurements."""

@@ -36,14 +36,12 @@ from jaxcal.solvers.closed_form.reduced_objective import (
     ImageData,
     ReducedObjective,
     image_data,
-    knows_spacing,
     reduce,
 )
 from jaxcal.solvers.closed_form.single import descend, feasible, scalar_root
 
 if TYPE_CHECKING:
     from jaxcal.data.problem import Problem
-    from jaxcal.data.recording import Images
 
 ODDS = 1e6
 """How many times more probable the data must be with a slip corrected."""
@@ -77,11 +75,11 @@ ANISOTROPY = 1.02
 """If the two spacings differ by a smaller factor, they do not show whether u and v are swapped."""
 
 
-def wrong_frames(data: Problem | Images, estimate: tuple[str, ...] = ()) -> str | None:
+def wrong_frames(problem: Problem, estimate: tuple[str, ...] = ()) -> str | None:
     """What is wrong with the frames or units, and what to do, in one line; None if nothing is."""
-    known = knows_spacing(data)
+    known = problem.spacing_known
     try:
-        images, _ = image_data(data, () if known else ("scale",))
+        images, _ = image_data(problem, () if known else ("scale",))
     except InputError:
         return None
     rows = np.unique(np.linspace(0, len(images.points) - 1, MOST_IMAGES).astype(int))

@@ -30,7 +30,7 @@ from jaxcal.model.unknowns import (
     with_prior,
 )
 from jaxcal.runtime.array_types import AnyArray, Float
-from jaxcal.runtime.arrays import array_module
+from jaxcal.runtime.arrays import array_module, map_arrays
 from jaxcal.solvers.plan import TUNED
 
 if TYPE_CHECKING:
@@ -40,6 +40,9 @@ if TYPE_CHECKING:
     from jaxcal.solvers.closed_form.single import ClosedForm
 
 Array = np.ndarray
+
+KINDS = ("lateral", "range", "elevational")
+"""Kinds of errors."""
 
 
 @dataclass(frozen=True)
@@ -63,8 +66,8 @@ class Unknowns:
     @classmethod
     def of(cls, answer: Calibration) -> Unknowns:
         """The unknowns of calibrations with one leading axis."""
-        x, values = np.asarray(answer.image_to_probe), answer.linearisation.further
-        further = {} if values is None else split_further(np.asarray(values), answer.blocks)
+        x = np.asarray(answer.image_to_probe)
+        further = split_further(answer.linearisation.further, answer.blocks)
         return cls(x[:, :3, :3], x[:, :3, 3], np.asarray(answer.point), further)
 
     @classmethod
@@ -116,6 +119,12 @@ class ImageErrors:
         """The errors of calibrations with one leading axis, which hold their problem."""
         assert answer.problem is not None
         return cls.of(Unknowns.of(answer), answer.problem, answer.blocks)
+
+    @classmethod
+    def of_closed_form(cls, found: ClosedForm, problem: Problem, blocks: Blocks) -> ImageErrors:
+        """The errors of a closed form of one problem, with a leading axis of length 1."""
+        alone = map_arrays(lambda leaf: np.asarray(leaf, float)[None], problem)
+        return cls.of(Unknowns.of_closed_form(found, problem), alone, blocks)
 
     @classmethod
     def of(

@@ -34,8 +34,8 @@ import numpy as np
 
 from jaxcal import CalibrationError, InputError
 from jaxcal.diagnostics.image_errors import (
+    KINDS,
     ImageErrors,
-    Unknowns,
     Whitened,
     further_prior,
     own_covariance,
@@ -48,14 +48,9 @@ from jaxcal.runtime.arrays import map_arrays
 from jaxcal.solvers.plan import TUNED
 
 if TYPE_CHECKING:
-    from jaxcal.data.problem import Problem
-    from jaxcal.model.unknowns import Blocks
     from jaxcal.result.calibration import Calibration
 
 Array = np.ndarray
-
-KINDS = ("lateral", "range", "elevational")
-"""Kinds of errors."""
 
 _LEAST_LEFT = 1e-6
 """Least share of an error's variance after the fit, for images that the unknowns depend on."""
@@ -285,24 +280,17 @@ class EqualWeights:
 
 
 def conventional_fit(
-    unknowns: Unknowns,
-    problem: Problem,
-    blocks: Blocks,
-    used: Array,
-    noise: Float[Array, "n 3 3"],
+    seen: ImageErrors, used: Bool[Array, " n"], noise: Float[Array, "n 3 3"]
 ) -> EqualWeights:
     """How good the fit with equal weights is, if errors have other covariances N_i.
 
     Its covariance is A^-1 (sum of R_i' N_i R_i) A^-1 with A = sum of R_i' R_i.
 
     Args:
-        unknowns: of the conventional fit (one leading axis of length 1).
-        problem: the data, with the same leading axis.
-        blocks: its unknowns.
+        seen: the images under the conventional fit (one leading axis of length 1).
         used: images in use.
         noise: covariance of every image's lateral, range and elevational errors, mm^2.
     """
-    seen = ImageErrors.of(unknowns, problem, blocks)
     zero = np.zeros_like(seen.mask)
     plain = _equal_weights(seen, zero, 1.0, used)
     left = max(plain.errors.size - plain.rows.shape[2], 1)

@@ -184,8 +184,7 @@ def range_of_row_zero(
 
 def beside_scale(calibration: Calibration) -> Values:
     """The estimated further unknowns but for the scale, which is in ``scale_mm_per_px``."""
-    further = calibration.linearisation.further
-    found = {} if further is None else split_further(further, calibration.blocks)
+    found = split_further(calibration.linearisation.further, calibration.blocks)
     return {name: value for name, value in found.items() if name != "scale"}
 
 

@@ -66,11 +66,14 @@ def reconstruction_precision(
 
 @traceable
 def reconstruct(
-    image_to_probe: Float[AnyArray, "4 4"],
+    image_to_probe: Float[AnyArray, "*images 4 4"],
     poses: Float[AnyArray, "n 4 4"],
     points: Float[AnyArray, "n columns"],
 ) -> Float[AnyArray, "n 3"]:
-    """B_i X p_i: image points in the tracker's frame, mm; (n, 2) points lie in the plane."""
+    """B_i X p_i: image points in the tracker's frame, mm; (n, 2) points lie in the plane.
+
+    X is (4, 4), or (n, 4, 4) with one for each image.
+    """
     xp = array_module(image_to_probe, poses, points)
     points = xp.asarray(points)
     if points.shape[1] == 2:

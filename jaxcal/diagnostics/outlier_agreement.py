@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.data.poses import targets_in_images
 from jaxcal.data.problem import Problem
+from jaxcal.diagnostics.image_errors import ImageErrors
 from jaxcal.model.image_points import distance
+from jaxcal.model.unknowns import RIGID
 from jaxcal.runtime.array_types import Float
 from jaxcal.solvers.closed_form.single import ClosedForm, solve_problem
 
@@ -78,12 +79,7 @@ def agreeing_outliers(
 
 def _sd_in_image(found: ClosedForm, problem: Problem, used: np.ndarray) -> float:
     """SD of the errors within the image of a conventional fit, mm."""
-    size = _pixel_size(found, problem)
-    measured = np.asarray(problem.measurements, float)[used] * size
-    measured[:, 1] += float(np.asarray(problem.face_offset))
-    poses = np.asarray(problem.poses, float)[used]
-    q = targets_in_images(poses, found.image_to_probe, found.point_mm)
-    off = np.stack([q[:, 0], np.hypot(q[:, 1], q[:, 2])], axis=1) - measured
+    off = ImageErrors.of_closed_form(found, problem, RIGID).errors[0, used, :2]
     freedom = max(2 * len(off) - 6, 1)
     return math.sqrt(float(np.sum(off**2)) / freedom)
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Protocol, TypedDict, runtime_checkable
 
 import numpy as np
 
+from jaxcal.diagnostics.image_errors import KINDS
 from jaxcal.diagnostics.residual_checks import FEWEST_TO_CHECK
 from jaxcal.runtime.array_types import AnyArray
 from jaxcal.runtime.arrays import finite_or_none
@@ -14,7 +15,6 @@ from jaxcal.runtime.arrays import finite_or_none
 if TYPE_CHECKING:
     from jaxcal.result.calibration import Calibration
 
-COMPONENTS = ("lateral", "range", "elevational")
 SUSPECTED = 0.02
 """Half of this is the share of recordings with Gaussian errors in which chance alone makes an
 image suspect."""
@@ -55,7 +55,7 @@ def outliers(result: HasOutliers) -> list[int]:
 
 
 def outlier_reasons(
-    result: HasOutliers, components: tuple[str, ...] = COMPONENTS
+    result: HasOutliers, components: tuple[str, ...] = KINDS
 ) -> list[OutlierReason]:
     """For every outlier: its most deviant component, by how many SDs, and whether it was left out.
 
@@ -76,7 +76,7 @@ def outlier_reasons(
     return found
 
 
-def listed_outliers(result: HasOutliers, components: tuple[str, ...] = COMPONENTS) -> str:
+def listed_outliers(result: HasOutliers, components: tuple[str, ...] = KINDS) -> str:
     """The first ten outliers with component and SDs, in words."""
     reasons = outlier_reasons(result, components)
     told = [
@@ -103,7 +103,7 @@ def suspects(result: Calibration) -> list[OutlierReason]:
     return [
         {
             "image": int(image),
-            "component": COMPONENTS[1],
+            "component": KINDS[1],
             "sds": finite_or_none(error[image]),
             "left_out": False,
         }

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxcal.diagnostics.directions import check_one, observability
+from jaxcal.diagnostics.image_errors import KINDS
 from jaxcal.diagnostics.misfits import misfits
 from jaxcal.diagnostics.outliers import listed_outliers, outliers, suspects_in_words
 from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
@@ -122,7 +123,7 @@ def _sds_not_tuned(result: Calibration) -> list[str]:
             text += f": this takes at least {MINIMUM_SELF_TUNING} images, and {used} are used"
         found.append(text)
     if np.any(result.sigma_floored):
-        errors = zip(("lateral", "range", "elevational"), result.sigma_floored, strict=True)
+        errors = zip(KINDS, result.sigma_floored, strict=True)
         names = [name for name, floored in errors if floored]
         rest = "error is" if len(names) == 1 else "errors are"
         owner = "its SD is" if len(names) == 1 else "their SDs are"

@@ -40,10 +40,8 @@ from jaxcal.data.problem import Problem
 from jaxcal.model.batch import ImagePlanes, Iterate, check_batch, pad_images, targets
 from jaxcal.model.thresholds import LARGEST_ELEVATION
 from jaxcal.model.unknowns import (
-    DELAY_SD_S,
     FURTHER,
     RIGID_UNKNOWNS,
-    SOUND_SPEED_SD_M_S,
     TABLE,
     Blocks,
     block_slice,
@@ -614,28 +612,30 @@ class MediumPrior(eqx.Module):
         cls,
         problems: Problem,
         blocks: Blocks,
-        *,
-        sound_speed_sd: Float[AnyArray, ""] | float = SOUND_SPEED_SD_M_S,
-        delay_sd: Float[AnyArray, ""] | float = DELAY_SD_S,
+        **prior_sd: Float[AnyArray, ""] | float,
     ) -> MediumPrior | None:
         """The prior of those of sound speed and delay that are free; None where neither is.
 
         Args:
             problems: a batch (one leading axis), for its nominal sound speeds.
             blocks: the free unknowns.
-            sound_speed_sd: SD of the sound speed, m/s.
-            delay_sd: SD of the delay, s.
+            **prior_sd: ``sound_speed_sd``, m/s, and ``delay_sd``, s, as :func:`jaxcal.calibrate`
+                takes them.
 
         Raises:
+            TypeError: another name.
             InputError: an SD that is not positive; one problem, or a batch with more axes.
         """
         check_batch(problems)
-        given = {"sound-speed": (sound_speed_sd, "m/s"), "delay": (delay_sd, "s")}
+        rows = [TABLE[name] for name in with_prior(FURTHER)]
+        for name in prior_sd.keys() - {row.prior_name for row in rows}:
+            raise TypeError(f"MediumPrior.of() got an unexpected keyword argument {name!r}")
         speed, steps = problems.nominal_sound_speed, []
-        for name in with_prior(blocks):
-            sd, unit = given[name]
-            _check_values(f"{TABLE[name].field}_sd", sd, unit=unit)
-            steps.append(jnp.broadcast_to(sd * TABLE[name].per_unit(speed), speed.shape))
+        for row in rows:
+            if row.name in blocks:
+                sd = prior_sd.get(row.prior_name, row.prior_sd)
+                _check_values(row.prior_name, sd, unit=row.prior_unit)
+                steps.append(jnp.broadcast_to(sd * row.per_unit(speed), speed.shape))
         return cls(jnp.stack(steps), blocks) if steps else None
 
     def deviations(self, iterate: Iterate) -> list[tuple[int, Array, Array]]:

@@ -40,8 +40,9 @@ class Unknown:
         words: one component in words, with a place for the axis.
         axes: the words for that place.
         oblique: several components in words; empty for a single one.
-        prior_sd: SD of its Gaussian prior about the nominal value, in the unit in which a caller
-            gives it, where the caller gives none; None: it has no prior.
+        prior_sd: SD of its Gaussian prior about the nominal value where the caller gives none;
+            None: it has no prior.
+        prior_unit: the unit of that SD.
         per_unit: from the nominal sound speed (m/s) to the step that is one such unit.
     """
 
@@ -54,6 +55,7 @@ class Unknown:
     axes: tuple[str, ...] = ("",)
     oblique: str = ""
     prior_sd: float | None = None
+    prior_unit: str = ""
     per_unit: Callable[[Any], Any] = lambda speed: 1.0
 
     @property
@@ -65,6 +67,11 @@ class Unknown:
     def field(self) -> str:
         """Its name as a name in Python."""
         return self.name.replace("-", "_")
+
+    @property
+    def prior_name(self) -> str:
+        """The argument by which a caller gives the SD of its prior."""
+        return f"{self.field}_sd"
 
     @property
     def nominal(self) -> float:
@@ -133,6 +140,7 @@ TABLE = {
             in_image=True,
             words="sound speed{}",
             prior_sd=SOUND_SPEED_SD_M_S,
+            prior_unit="m/s",
             per_unit=lambda speed: 1 / speed,
         ),
         Unknown(
@@ -143,6 +151,7 @@ TABLE = {
             in_image=True,
             words="delay{}",
             prior_sd=DELAY_SD_S,
+            prior_unit="s",
             per_unit=lambda speed: 1e3 * speed,
         ),
     )
@@ -281,13 +290,17 @@ def with_prior(blocks: Blocks) -> Blocks:
 
 
 def split_further(values: Any, blocks: Blocks) -> dict[str, list[Any]]:
-    """Arrays (..., k) of all free further unknowns as components of each, by name."""
-    first = RIGID_UNKNOWNS
+    """The components of each free further unknown, by name.
+
+    Args:
+        values: all of them, (..., k); None if there are none.
+        blocks: the free unknowns.
+    """
     found = {}
     for name in FURTHER:
         if name in blocks:
             at = block_slice(blocks, name)
-            found[name] = [values[..., k - first] for k in range(at.start, at.stop)]
+            found[name] = [values[..., k - RIGID_UNKNOWNS] for k in range(at.start, at.stop)]
     return found
 
 

@@ -20,13 +20,11 @@ import numpy as np
 
 from jaxcal import InputError
 from jaxcal.data.poses import targets_in_images
-from jaxcal.data.problem import Problem
 from jaxcal.data.recording import LARGEST, Recording
 from jaxcal.design.candidates import seen_region
 from jaxcal.design.constraints import Region
-from jaxcal.diagnostics.image_errors import Unknowns, noise_covariance
+from jaxcal.diagnostics.image_errors import KINDS, ImageErrors, noise_covariance
 from jaxcal.diagnostics.influence import (
-    KINDS,
     Influence,
     conventional_fit,
     excess,
@@ -45,9 +43,8 @@ from jaxcal.model.image_points import distance, mean_of_squares
 from jaxcal.report.contradictions import contradictions
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Float
-from jaxcal.runtime.arrays import map_arrays
 from jaxcal.runtime.given_values import real_array
-from jaxcal.solvers.closed_form.calibrate import calibrate_closed_form
+from jaxcal.solvers.closed_form.single import solve_problem
 
 GOOD_MM = 0.5
 """Largest error to expect at the image (root mean square) that is called good."""
@@ -84,9 +81,6 @@ def accuracy_record(
         return nothing
     if result.wrong_frames is not None:
         return nothing
-    problem = answer.problem
-    if problem is None:
-        answer = answer.with_problem(Problem.from_recording(recording)).numpy()
     region = region_of(answer, recording)
     grid = region.grid()[:, [0, 2]]
     weight = mean_of_squares(image_jacobian(answer, grid))
@@ -103,17 +97,16 @@ def accuracy_record(
         "tre": tre,
         "limits": _limits(answer, found, weight),
         "influence": influence,
-        "comparison": _comparison(answer, recording, found, grid),
+        "comparison": _comparison(answer, found, grid),
     }
 
 
 def as_solved(recording: Recording, answer: Calibration) -> Recording:
     """The recording with the images of the solve, in which every pose counts once."""
-    images, problem = recording.calibration, answer.problem
-    if problem is None:
-        return recording
+    problem = answer.problem
+    assert problem is not None
     images = replace(
-        images,
+        recording.calibration,
         poses=np.asarray(problem.poses, float),
         measurements=np.asarray(problem.measurements, float),
         mask=np.asarray(problem.mask) > 0,
@@ -253,31 +246,29 @@ def _unmodelled(answer: Calibration, grid: Float[np.ndarray, "m 2"]) -> dict[str
 
 
 def _comparison(
-    answer: Calibration, recording: Recording, found: Influence, grid: Float[np.ndarray, "m 2"]
+    answer: Calibration, found: Influence, grid: Float[np.ndarray, "m 2"]
 ) -> dict[str, Any] | None:
     """Compares an answer of another method with the conventional fit of the same images."""
     estimate = tuple(name for name in ("scale",) if name in answer.blocks)
     further = {"sound-speed", "delay"} & set(answer.blocks)
-    images, problem = recording.calibration, answer.problem
+    problem = answer.problem
     if answer.method == "conventional" or further or problem is None:
         return None
     if answer.data == "channels":
         return None
     used = np.asarray(answer.mask) > 0
     try:
-        other = calibrate_closed_form(replace(images, mask=used), estimate=estimate)
+        other = solve_problem(replace(problem, mask=used), estimate)
     except InputError:
         return None
     x, spacing = np.asarray(other.image_to_probe), np.asarray(problem.spacing, float)
     scale = np.ones(2)
     if other.scale_mm_per_px is not None:
         scale = np.asarray(other.scale_mm_per_px) / spacing
-    alone = map_arrays(lambda leaf: np.asarray(leaf, float)[None], problem)
-    unknowns = Unknowns.of_closed_form(other, problem)
     noise = np.asarray(noise_covariance(answer, problem), float)
     if not np.isfinite(noise[used]).all():
         return None
-    fit = conventional_fit(unknowns, alone, answer.blocks, used, noise)
+    fit = conventional_fit(ImageErrors.of_closed_form(other, problem, answer.blocks), used, noise)
     jacobian = image_jacobian(answer, grid)
     error = np.einsum("mia,ab,mib->", jacobian, fit.covariance, jacobian) / len(grid)
     gaussian = np.einsum("mia,ab,mib->", jacobian, found.model_covariance, jacobian) / len(grid)

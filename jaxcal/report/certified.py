@@ -8,16 +8,17 @@ from typing import Any
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.data.recording import Images, Recording
-from jaxcal.data.sound import WATER_M_S
+from jaxcal.data.problem import Problem
+from jaxcal.data.recording import Images
 from jaxcal.model.unknowns import FURTHER
 from jaxcal.result.calibration import Calibration
 from jaxcal.solvers.closed_form.calibrate import calibrate_closed_form
 from jaxcal.solvers.closed_form.certificate import certify
 from jaxcal.solvers.closed_form.reduced_objective import Certificate
+from jaxcal.solvers.closed_form.single import solve_problem
 
 
-def certificate_record(result: Calibration, recording: Recording) -> dict[str, Any]:
+def certificate_record(result: Calibration) -> dict[str, Any]:
     """``certified`` and ``gap_mm2`` of Eq. 7's minimum on the images in use.
 
     For the conventional method they are those of the answer. The other methods minimise a different
@@ -25,35 +26,28 @@ def certificate_record(result: Calibration, recording: Recording) -> dict[str, A
     is no closed form (e.g. an estimated delay) or no answer.
 
     Args:
-        result: of one problem.
-        recording: with the images of the solve (:func:`jaxcal.report.accuracy.as_solved`).
+        result: of one problem, with this problem.
     """
     nothing: dict[str, Any] = {"certified": None, "gap_mm2": None}
-    images = replace(recording.calibration, mask=np.asarray(result.mask) > 0)
+    assert result.problem is not None
+    problem = replace(result.problem, mask=result.mask)
     estimate = tuple(name for name in FURTHER if name in result.blocks)
     own = result.method == "conventional"
     if not (estimate in ((), ("scale",)) or own):
         return nothing
     try:
-        if own:
-            found = _of_answer(result, images, recording, estimate)
-        else:
-            found = calibrate_closed_form(images, estimate=estimate)
+        found = _of_answer(result, problem, estimate) if own else solve_problem(problem, estimate)
     except InputError:
         return nothing
     return {"certified": found.certified, "gap_mm2": found.gap_mm2}
 
 
-def _of_answer(
-    result: Calibration, images: Images, recording: Recording, estimate: tuple[str, ...]
-) -> Certificate:
+def _of_answer(result: Calibration, problem: Problem, estimate: tuple[str, ...]) -> Certificate:
     factor, scale = 1.0, result.scale_mm_per_px
     if result.sound_speed_m_s is not None:
-        probe = recording.probe
-        nominal = WATER_M_S if probe is None else probe.sound_speed_m_s
-        factor = float(result.sound_speed_m_s) / nominal
+        factor = float(result.sound_speed_m_s / problem.nominal_sound_speed)
     return certify(
-        images,
+        problem,
         np.asarray(result.image_to_probe, dtype=float),
         np.asarray(result.point, dtype=float),
         scale_mm_per_px=None if scale is None else np.asarray(scale, dtype=float),

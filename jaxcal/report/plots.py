@@ -17,26 +17,27 @@ from matplotlib.figure import Figure
 from jaxcal import InputError
 from jaxcal.data.poses import targets_in_images
 from jaxcal.data.recording import Recording
-from jaxcal.diagnostics.influence import KINDS, in_image, influence_of
+from jaxcal.diagnostics.image_errors import KINDS
+from jaxcal.diagnostics.influence import in_image, influence_of
 from jaxcal.diagnostics.intervals import image_jacobian, tre_at
 from jaxcal.diagnostics.outliers import outliers, suspects
 from jaxcal.model.image_points import mean_of_squares
 from jaxcal.report.accuracy import error_shares, region_of, scatter_shares
 from jaxcal.report.convergence import Curve
 from jaxcal.report.summary import recording_of
-from jaxcal.report.svg import bar_length, drawn, spread_out
+from jaxcal.report.svg import BLUE, GREEN, ORANGE, bar_length, drawn, spread_out
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.given_values import real_array
 
 COLUMN_MM, PAGE_MM = 88.0, 180.0
-BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
-"""Colours of Okabe and Ito, which the colour-blind can tell apart; each kind of error has one."""
+GREY = "#666666"
 _ROUNDING = 3e-14
 """An excess of the objective below this relative size is only rounding."""
 _ALONG_A_SIDE = 61
 """Points along each side of the map of the error."""
 COLOURS = {"lateral": BLUE, "range": GREEN, "axial": GREEN, "elevational": ORANGE}
+"""Of each kind of error."""
 
 
 def canvas(width_mm: float, height_mm: float) -> Figure:

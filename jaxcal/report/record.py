@@ -136,7 +136,7 @@ def calibration_record(
         "point_covariance_mm2": answer.point_covariance if known else None,
         "observability": result.observability,
         "rms_mm": answer.rms,
-        **certificate_record(answer, solved),
+        **certificate_record(answer),
         "reconstruction_precision_mm": _precision(answer, images),
         "reconstruction_precision_set": "calibration" if tested is None else "test",
         "reconstruction_precision_images": int(np.sum(images.mask)),
@@ -179,7 +179,6 @@ def further_unknowns(answer: Calibration) -> dict[str, dict[str, Any]]:
         answer: one calibration in numpy arrays.
     """
     found, blocks = answer.linearisation, answer.blocks
-    further = {} if found.further is None else split_further(found.further, blocks)
     sd = np.sqrt(np.diagonal(answer.unknowns_covariance))
     prior: dict[str, Any] = {}
     if found.prior_sd is not None:
@@ -191,7 +190,7 @@ def further_unknowns(answer: Calibration) -> dict[str, dict[str, Any]]:
             "sd": sd[block_slice(blocks, name)],
             "prior_sd": prior.get(name),
         }
-        for name, values in further.items()
+        for name, values in split_further(found.further, blocks).items()
     }
 
 

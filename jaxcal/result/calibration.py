@@ -14,7 +14,7 @@ from jaxcal import CalibrationError, InputError
 from jaxcal.data.probe import Probe
 from jaxcal.data.problem import Problem
 from jaxcal.model.distributions import OffsetLaw
-from jaxcal.model.unknowns import TABLE, Blocks, in_image
+from jaxcal.model.unknowns import TABLE, Blocks, Values, block_slice, in_image, with_prior
 from jaxcal.result.saved import check_target, dated
 from jaxcal.result.transform import AppliedPoints, ImageTransform, SaveFormat
 from jaxcal.runtime.array_types import AnyArray, Bool, Float, Int
@@ -62,6 +62,47 @@ class Medium:
     delay_s: Float[AnyArray, "*batch"] | None = None
     delay_sd_s: Float[AnyArray, "*batch"] | None = None
     delay_prior_s: Float[AnyArray, "*batch"] | None = None
+
+    @classmethod
+    def of(
+        cls,
+        values: Values,
+        covariance: Float[AnyArray, "*batch p p"],
+        blocks: Blocks,
+        problem: Problem,
+        prior_sd: Float[AnyArray, "*batch k"] | None = None,
+    ) -> Medium | None:
+        """Those of sound speed and delay that are free; None where neither is (traceable).
+
+        Args:
+            values: of the free further unknowns (:func:`jaxcal.model.unknowns.measured`).
+            covariance: of all unknowns.
+            blocks: the free unknowns.
+            problem: for its nominal sound speed and delay.
+            prior_sd: prior SDs of those that have one (:func:`jaxcal.model.unknowns.with_prior`),
+                m/s and s.
+        """
+        xp, speed = array_module(covariance), problem.nominal_sound_speed
+        prior: dict[str, Any] = {}
+        found: dict[str, Any] = {}
+        if prior_sd is not None:
+            prior = dict(zip(with_prior(blocks), xp.moveaxis(prior_sd, -1, 0), strict=True))
+
+        def step_sd(name: str) -> Any:
+            at = block_slice(blocks, name).start
+            return xp.sqrt(covariance[..., at, at])
+
+        if "sound-speed" in blocks:
+            estimate = speed * values["sound-speed"][0]
+            found["sound_speed_m_s"] = xp.asarray(estimate)
+            found["sound_speed_sd_m_s"] = xp.asarray(estimate * step_sd("sound-speed"))
+            found["sound_speed_prior_m_s"] = prior.get("sound-speed")
+        if "delay" in blocks:
+            nominal, mm_per_s = 0.0 if problem.delay is None else problem.delay, 1e3 * speed
+            found["delay_s"] = xp.asarray(nominal + values["delay"][0] / mm_per_s)
+            found["delay_sd_s"] = xp.asarray(step_sd("delay") / mm_per_s)
+            found["delay_prior_s"] = prior.get("delay")
+        return cls(**found) if found else None
 
 
 @array_tree

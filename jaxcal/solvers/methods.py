@@ -117,7 +117,7 @@ def observe(
     sigma = jnp.broadcast_to(sigma[:, None], (len(fallback), images.batch_size))
     medium = None
     if given.prior_sd is not None:
-        names = [f"{TABLE[name].field}_sd" for name in with_prior(plan.blocks)]
+        names = [TABLE[name].prior_name for name in with_prior(plan.blocks)]
         medium = MediumPrior.of(
             problems, plan.blocks, **dict(zip(names, given.prior_sd, strict=True))
         )

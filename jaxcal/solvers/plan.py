@@ -42,14 +42,6 @@ DEFAULT_MAX_ELEVATION_MM = 1.0
 MOST_STEPS = 10**7
 """Most rounds, steps and kept values that can be asked for."""
 
-_UNITS = {
-    "sound_speed_sd": "m/s",
-    "delay_sd": "s",
-    "tolerance_rad": "rad",
-    "gradient_tolerance": "",
-}
-"""Units of numbers of a request that are not in mm."""
-
 
 @dataclass(frozen=True)
 class Options:
@@ -97,8 +89,10 @@ class Options:
         if not is_one_of(self.precision, Precision):
             raise InputError(f"precision must be float64 or float32, not {shown(self.precision)}")
         check_flag("differentiate", self.differentiate)
-        for name in ("gradient_tolerance", "tolerance_rad", "tolerance_mm"):
-            check_size(name, getattr(self, name), np.finfo(float).tiny)
+        tiny = np.finfo(float).tiny
+        check_size("gradient_tolerance", self.gradient_tolerance, tiny, unit="")
+        check_size("tolerance_rad", self.tolerance_rad, tiny, unit="rad")
+        check_size("tolerance_mm", self.tolerance_mm, tiny)
         for name in ("max_rounds", "inner_steps", "max_iterations", "trace"):
             whole_number(name, getattr(self, name), int(name != "trace"), MOST_STEPS)
 
@@ -175,16 +169,15 @@ def _check_static(solver: optx.AbstractLeastSquaresSolver) -> None:
         ) from None
 
 
-def check_size(name: str, value: Any, least: float, *, one: bool = True) -> None:
+def check_size(name: str, value: Any, least: float, *, one: bool = True, unit: str = "mm") -> None:
     """Check one number, or several; of traced ones, that it is one."""
     numbers = np.array(np.nan)
     if not is_traced(value):
         with suppress(InputError):
             numbers = real_array(value, name)
         if not (np.isfinite(numbers).all() and (numbers >= least).all()):
-            unit = _UNITS.get(name, "mm")
-            unit = f", in {unit}" if unit else ""
             wanted = "positive" if least > 0 else "not negative"
+            unit = f", in {unit}" if unit else ""
             raise InputError(f"{name} must be finite and {wanted}{unit}, not {shown(value)}")
     if one and np.shape(value) != ():
         raise InputError(f"{name} must be one number, not {shown(value)}")

@@ -10,7 +10,7 @@ from typing import Literal, get_args
 from jaxcal import InputError
 from jaxcal.runtime.messages import shown
 
-OffsetLaw = Literal[
+LawName = Literal[
     "uniform",
     "normal",
     "one-sided",
@@ -24,7 +24,7 @@ OffsetLaw = Literal[
     "sometimes off-centre",
 ]
 
-OFFSET_LAWS: tuple[OffsetLaw, ...] = get_args(OffsetLaw)
+OFFSET_LAWS: tuple[LawName, ...] = get_args(LawName)
 
 
 def check_law(law: object, name: str = "elevation_distribution") -> None:

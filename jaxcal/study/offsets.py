@@ -29,7 +29,7 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from jaxcal.study import draws
-from jaxcal.study.laws import OffsetLaw, check_law
+from jaxcal.study.laws import LawName, check_law
 
 DEGREES_OF_FREEDOM = 4.0
 """Of the heavy-tailed law, Student's t."""
@@ -47,7 +47,7 @@ _SOMETIMES, _MEAN_SD = 0.1, 2.0
 """How often the sometimes off-centre law has a mean; the mean's SD. Prior ``auto`` assumes both."""
 
 
-def standard_offsets(key: Key[Array, ""], law: OffsetLaw, count: int) -> Float[Array, " count"]:
+def standard_offsets(key: Key[Array, ""], law: LawName, count: int) -> Float[Array, " count"]:
     """Draw ``count`` offsets of size 1 mm (bound or SD), to be multiplied by another size.
 
     Args:
@@ -100,7 +100,7 @@ def standard_offsets(key: Key[Array, ""], law: OffsetLaw, count: int) -> Float[A
     return 2 * draws.uniforms(key, 0, count) - 1
 
 
-def nominal_bound(law: OffsetLaw, size: float) -> float:
+def nominal_bound(law: LawName, size: float) -> float:
     """The bound that counts as the true one of a law, mm.
 
     It is m for laws with a bound. Laws with an SD have none: sqrt(3) s, the bound of the uniform
@@ -110,7 +110,7 @@ def nominal_bound(law: OffsetLaw, size: float) -> float:
     return size if law in _BOUNDED else float(np.sqrt(3.0)) * size
 
 
-def standard_deviation(law: OffsetLaw) -> float:
+def standard_deviation(law: LawName) -> float:
     """SD about the mean of one recording's offsets, for a law of size 1."""
     check_law(law)
     squares = {

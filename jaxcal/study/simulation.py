@@ -46,7 +46,7 @@ from jaxcal.runtime.given_values import (
 from jaxcal.runtime.jax_modes import in_own_modes, require_float64
 from jaxcal.runtime.messages import shown
 from jaxcal.study import draws
-from jaxcal.study.laws import OffsetLaw, check_law
+from jaxcal.study.laws import LawName, check_law
 from jaxcal.study.offsets import standard_offsets
 
 Scalar = float | Float[Array, ""]
@@ -81,7 +81,7 @@ class Protocol:
     images: int = 50
     test_images: int = 50
     elevation_mm: Scalar = 1.0
-    elevation_distribution: OffsetLaw = "uniform"
+    elevation_distribution: LawName = "uniform"
     noise_mm: Scalar = 0.5
     lateral_mm: Scalar = 29.25
     depth_mm: tuple[Scalar, Scalar] = (10.0, 90.0)

@@ -68,7 +68,7 @@ from jaxcal.runtime.messages import quoted, shown
 from jaxcal.solvers.names import Method, PriorName
 from jaxcal.solvers.plan import DEFAULT_MAX_ELEVATION_MM, Options, Prior
 from jaxcal.study.interface import ArraySpec, Chunk
-from jaxcal.study.laws import OffsetLaw, check_law
+from jaxcal.study.laws import LawName, check_law
 
 MAXIMUM_BYTES = 2**20
 """Largest spec that is read."""
@@ -133,7 +133,7 @@ _FLOATS = ("max_elevation_mm", "max_elevation_factor", "tolerance_rad", "toleran
 class Condition:
     """One cell of the grid; the fields are those of ``[conditions]``, each with one value."""
 
-    elevation_distribution: OffsetLaw = "uniform"
+    elevation_distribution: LawName = "uniform"
     images: int = 50
     test_images: int = 50
     test_fraction: float = 0.75

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from jaxcal.data.problem import Problem, as_batch, check_shapes
 from jaxcal.model.unknowns import unknown_names
 from jaxcal.runtime.arrays import is_traced
@@ -43,12 +41,10 @@ def calibrate_closed_form(
         InputError: other names in ``estimate``, data that cannot be used, fewer than 4 images.
     """
     names = unknown_names(estimate)
-    if isinstance(problem, list | tuple):
-        problem = as_batch(problem, "jaxcal.calibrate_closed_form")
-    if isinstance(problem, Problem):
-        check_shapes(problem)
-    if np.ndim(getattr(problem, "mask", ())) > 1 or is_traced(problem):
+    problems = as_batch(problem, "jaxcal.calibrate_closed_form", channels=False)
+    check_shapes(problems)
+    if problems.batch_shape or is_traced(problems):
         from jaxcal.solvers.closed_form.batch import solve_batch
 
-        return solve_batch(problem, names)  # pyright: ignore[reportArgumentType]
-    return solve_problem(problem, names)  # pyright: ignore[reportArgumentType]
+        return solve_batch(problems, names)
+    return solve_problem(problems, names)

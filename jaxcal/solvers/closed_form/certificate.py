@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxcal import InputError
+from jaxcal.data.problem import as_problem
 from jaxcal.model.unknowns import unknown_names
 from jaxcal.runtime.array_types import AnyArray, Float
 from jaxcal.runtime.arrays import is_traced
@@ -64,6 +65,7 @@ def certify(
     """
     if is_traced(problem, image_to_probe, point, scale_mm_per_px, sound_speed_factor):
         raise InputError("certify is computed by numpy: call it outside of jit, vmap and grad")
+    problem = as_problem(problem, "jaxcal.certify", channels=False)
     data, constraints = image_data(problem, unknown_names(estimate))
     reduced = reduce(data, constraints)
     transform = real_array(image_to_probe, "image_to_probe")

@@ -42,7 +42,6 @@ from jaxcal.runtime.array_types import Bool, Float
 
 if TYPE_CHECKING:
     from jaxcal.data.problem import Problem
-    from jaxcal.data.recording import Images, Recording
 
 RANK_TOLERANCE = 1e-11
 """Singular values below this share of the largest possible one count as zero."""
@@ -168,43 +167,26 @@ class ReducedObjective:
 
 
 def image_data(
-    problem: Problem | Recording | Images, estimate: tuple[str, ...]
+    problem: Problem, estimate: tuple[str, ...]
 ) -> tuple[ImageData, QuadraticConstraints]:
-    """The images in use and the constraints, from any of the types that a caller may have.
+    """The images in use and the constraints.
 
     Raises:
         InputError: unknown names, a scale where there is none, or unusable images.
     """
-    estimate = tuple(estimate)
-    source: Any = getattr(problem, "calibration", problem)
-    if getattr(source, "kind", None) == "time_of_flight":
-        from jaxcal.data.problem import Problem
-
-        source = Problem.from_recording(problem)  # pyright: ignore[reportArgumentType]
-    if not hasattr(source, "mask"):
-        raise InputError(f"a problem or a recording is needed, not {type(problem).__name__}")
-    if hasattr(source, "kind"):
-        pixels, face = source.kind == "pixel", source.face_offset_mm
-        spacing = np.ones(2) if source.spacing_mm is None else np.asarray(source.spacing_mm, float)
-    else:
-        pixels, face = source.pixels, source.face_offset
-        spacing = np.asarray(source.spacing, dtype=float)
-    check_estimate(estimate, pixels, knows_spacing(source))
-    mask = np.asarray(source.mask)
+    check_estimate(estimate, problem.pixels, problem.spacing_known)
+    mask = np.asarray(problem.mask)
     if mask.ndim != 1:
         raise InputError(f"one problem is wanted, not a batch with axes {mask.shape[:-1]}")
-    poses, measurements = (
-        np.asarray(values, dtype=float) for values in (source.poses, source.measurements)
+    data = used_images(
+        np.asarray(problem.poses, dtype=float),
+        np.asarray(problem.measurements, dtype=float),
+        mask > 0,
+        np.asarray(problem.spacing, dtype=float),
+        float(problem.face_offset),
+        problem.pixels,
     )
-    data = used_images(poses, measurements, mask > 0, spacing, float(face), pixels)
     return data, CONSTRAINTS[estimate]
-
-
-def knows_spacing(source: Any) -> bool:
-    """Whether the size of the pixels of a problem or of images is known; of points in mm it is."""
-    if hasattr(source, "kind"):
-        return source.kind != "pixel" or source.spacing_mm is not None
-    return source.spacing_known
 
 
 def check_estimate(estimate: tuple[str, ...], pixels: bool, spacing_known: bool) -> None:

@@ -52,7 +52,6 @@ from jaxcal.solvers.closed_form.rotation_relaxation import lower_bound
 
 if TYPE_CHECKING:
     from jaxcal.data.problem import Problem
-    from jaxcal.data.recording import Images, Recording
     from jaxcal.model.unknowns import Blocks
 
 Numbers = Any
@@ -135,9 +134,7 @@ class Start:
     searched: Bool[HeldArray, "*batch"]
 
 
-def solve_problem(
-    problem: Problem | Recording | Images, estimate: tuple[str, ...] = ()
-) -> ClosedForm:
+def solve_problem(problem: Problem, estimate: tuple[str, ...] = ()) -> ClosedForm:
     """One problem by numpy alone; as :func:`jaxcal.calibrate_closed_form`."""
     data, constraints = image_data(problem, estimate)
     reduced = reduce(data, constraints)
