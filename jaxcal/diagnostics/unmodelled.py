@@ -142,10 +142,14 @@ def unmodelled(calibration: Calibration) -> list[Unmodelled]:
         triangle = np.asarray(np.linalg.qr(np.swapaxes(both, 0, 1), mode="r"))
         rows, errors = np.swapaxes(triangle[..., :-1], 0, 1), triangle[..., -1].T
         before, _ = _tuned(errors, rows[..., :unknowns], int(used.sum()))
+        parts = []
         for kind, image, _ in columns:
-            own = at + np.arange(_FREEDOM[kind])
-            part = rows[..., np.r_[:unknowns, own]]
+            parts.append((kind, image, rows[..., np.r_[:unknowns, at : at + _FREEDOM[kind]]]))
             at += _FREEDOM[kind]
+        steps = [each for each in parts if each[0] == "step"]
+        gains = _gains(errors, np.stack([part for _, _, part in steps]), before)
+        parts = [each for each in parts if each[0] != "step"] + [steps[int(np.argmax(gains))]]
+        for kind, image, part in parts:
             each = _fit(kind, errors, part, before, int(used.sum()))
             if each is not None:
                 found.append(replace(each, image=image))
@@ -181,9 +185,18 @@ def _columns(
     for image in images[np.unique(np.round(places).astype(int))]:
         after = np.where(np.arange(len(used)) < image, -0.5, 0.5)
         found.append(("step", int(image), after[:, None, None] * within))
-    return [
-        (kind, image, np.where(used[:, None, None], each, 0.0)) for kind, image, each in found
-    ]
+    return [(kind, image, np.where(used[:, None, None], each, 0.0)) for kind, image, each in found]
+
+
+def _gains(
+    errors: Float[Array, "m 3"], rows: Float[Array, "s m 3 q"], variance: Float[Array, " 3"]
+) -> Float[Array, " s"]:
+    """By how much each set of rows lowers the sum of squares, with the SDs as they are."""
+    weight = 1 / np.sqrt(variance)[:, None]
+    design = (rows * weight).reshape(len(rows), -1, rows.shape[-1])
+    scale = np.sqrt(np.maximum(np.sum(design**2, axis=1, keepdims=True), 1e-300))
+    basis = np.linalg.qr(design / scale)[0]
+    return np.sum((np.swapaxes(basis, 1, 2) @ (errors * weight[:, 0]).ravel()) ** 2, axis=1)
 
 
 def _fit(
