@@ -148,6 +148,12 @@ def test_hardly_anything_is_found_in_clean_recordings(answers, images):
     assert sum(bool(unmodelled(result)) for result in results) <= 2
 
 
+def test_fits_with_the_errors_of_a_tracker_are_looked_at_too(answers):
+    _, result = answers["step"][0]
+    tracked = replace(result.linearisation, tracker_sd=np.array(0.1))
+    assert "step" in {each.kind for each in unmodelled(replace(result, linearisation=tracked))}
+
+
 def test_a_second_echo_in_forty_per_cent_of_the_images_is_told_of(answers):
     [(spoilt, plain)] = answers["echoes"]
     for result in (plain, jaxcal.calibrate(spoilt, prior="gaussian", robust=True)):
