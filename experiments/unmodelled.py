@@ -1,14 +1,15 @@
 """Errors that the model leaves out: how often are they told of, and what becomes of the verdict?
 
 Simulated recordings (uniform offsets of SD 1 mm, noise level 1) without any fault and with one of
-six, calibrated with the default prior:
+seven, calibrated with the default prior:
 
 - ``scale``: ranges 4 % too long (a sound speed of 1540 m/s in water of 1480 m/s);
 - ``skew``: lateral positions off by 3 % of the depth;
 - ``beside``: all targets 6 mm farther from the image plane, to one side;
 - ``slip``: the image moves by 2 mm on the probe from the first image to the last;
 - ``second echo``: 40 % of the images, any of them, 5 mm too deep;
-- ``curve``: ranges too long by 1 mm 20 mm to the side, by the square of the lateral position.
+- ``curve``: ranges too long by 1 mm 20 mm to the side, by the square of the lateral position;
+- ``step``: the image moves by 2 mm on the probe at once, before the last quarter of the images.
 
 For each: the share in which something is told of (a kind of error that the model leaves out, or
 two groups), in which it is the right thing, in which the verdict is good or fair, and in which it
@@ -39,7 +40,7 @@ from jaxcal.report.record import calibration_record
 from jaxcal.runtime.jax_cache import enable_compilation_cache
 
 SEED = 20261123
-FAULTS = ("none", "scale", "skew", "beside", "slip", "second echo", "curve")
+FAULTS = ("none", "scale", "skew", "beside", "slip", "second echo", "curve", "step")
 IMAGES = (12, 30, 60)
 STRETCH, SKEW, BESIDE_MM, SLIP_MM, ECHO_MM, ECHO_SHARE = 1.04, 0.03, 6.0, 2.0, 5.0, 0.4
 CURVE_MM = 1.0
@@ -69,8 +70,10 @@ def draw(images: int, fault: str, indices: Array):
             poses = poses.at[:, :3, 3].add(-BESIDE_MM * (poses[:, :3, :3] @ x[:3, 1]))
             squared = points[:, 1] ** 2 - y**2 + (y + BESIDE_MM) ** 2
             points = points.at[:, 1].set(jnp.sqrt(squared))
-        if fault == "slip":
+        if fault in ("slip", "step"):
             part = SLIP_MM * jnp.linspace(-1.0, 0.0, images)
+            if fault == "step":
+                part = jnp.where(jnp.arange(images) < 3 * images // 4, -SLIP_MM, 0.0)
             poses = poses.at[:, :3, 3].add(-part[:, None] * (poses[:, :3, :3] @ x[:3, 0]))
         if fault == "second echo":
             order = jax.random.permutation(jax.random.fold_in(key, 7), images)

@@ -57,7 +57,9 @@ def random_images(generator, kind, count, optional, elements=8):
         "time": np.sort(generator.uniform(0, 60, count)),
     }
     if kind == "pixel":
-        values |= {"spacing_mm": generator.uniform(0.05, 0.3, 2), "face_offset_mm": 1.25}
+        values["spacing_mm"] = generator.uniform(0.05, 0.3, 2)
+    if kind != "time_of_flight":
+        values["face_offset_mm"] = 1.25
     chosen = {name: value for name, value in values.items() if name in optional}
     return make_images(random_poses(generator, count), measurements, kind, **chosen)
 

@@ -86,6 +86,9 @@ def test_a_problem_of_arrays_has_the_range_of_row_zero():
     assert made.face_offset == from_images.face_offset == 4.0
     with pytest.raises(InputError, match="face_offset_mm"):
         jaxcal.Problem.from_arrays(**given, face_offset_mm=np.nan)
+    times = np.full((len(given["poses"]), 8), 4e-5)
+    with pytest.raises(InputError, match="belongs to points and pixels"):
+        jaxcal.make_images(given["poses"], times, "time_of_flight", face_offset_mm=4.0)
 
 
 def test_numbers_of_frames_are_whole():

@@ -56,11 +56,11 @@ def beside(recording: Recording) -> Recording:
     return replace(recording, calibration=make_images(poses, points))
 
 
-def slipped(recording: Recording) -> Recording:
-    """The probe moves by 3 mm and 3 degrees beneath its marker."""
+def slipped(recording: Recording, parts: np.ndarray | None = None) -> Recording:
+    """The probe moves by 3 mm and 3 degrees beneath its marker; parts of it for every image."""
     images, x = recording.calibration, recording.truth.image_to_probe
     poses = images.poses.copy()
-    for row, part in enumerate(np.linspace(0.0, 1.0, len(images))):
+    for row, part in enumerate(np.linspace(0.0, 1.0, IMAGES) if parts is None else parts):
         slip = np.eye(4)
         slip[:3, :3] = Rotation.from_rotvec(np.radians(3.0) * part * np.eye(3)[1]).as_matrix()
         slip[:3, 3] = [3.0 * part, 0.0, 0.0]
@@ -68,8 +68,14 @@ def slipped(recording: Recording) -> Recording:
     return replace(recording, calibration=make_images(poses, images.measurements))
 
 
+def slipped_at_once(recording: Recording) -> Recording:
+    """The same at image 31, near the end."""
+    return slipped(recording, np.arange(IMAGES) >= 31)
+
+
 FAULTS = {
     "scale": wrong_scale, "skew": skewed, "curve": curved, "beside": beside, "slip": slipped,
+    "step": slipped_at_once,
 }  # fmt: skip
 WORDS = {
     "scale": "check pixel size",
@@ -77,6 +83,7 @@ WORDS = {
     "curve": "20 mm to either side of the middle",
     "beside": "beside the image plane in all images",
     "slip": "from the first image to the last",
+    "step": "(counted from 0)",
 }
 
 
@@ -119,6 +126,8 @@ def test_what_the_model_leaves_out_is_found_and_lowers_the_verdict(answers, kind
             values.append(tre["unmodelled"]["values"])
             assert any(WORDS[kind] in words for words in tre["contradictions"])
             assert tre["rms_mm"] > 1.2 * tre["stated_mm"]
+            if kind == "step":
+                assert abs(tre["unmodelled"]["image"] - 31) <= 2
     assert found >= 3
     middle = np.median(values, axis=0)
     if kind == "scale":
@@ -137,6 +146,12 @@ def test_hardly_anything_is_found_in_clean_recordings(answers, images):
     results = [result for _, result in answers[f"clean {images}"]]
     assert [result.images_used for result in results] == [images] * len(SEEDS)
     assert sum(bool(unmodelled(result)) for result in results) <= 2
+
+
+def test_fits_with_the_errors_of_a_tracker_are_looked_at_too(answers):
+    _, result = answers["step"][0]
+    tracked = replace(result.linearisation, tracker_sd=np.array(0.1))
+    assert "step" in {each.kind for each in unmodelled(replace(result, linearisation=tracked))}
 
 
 def test_a_second_echo_in_forty_per_cent_of_the_images_is_told_of(answers):

@@ -126,8 +126,8 @@ class IndependentImages:
             worth = self.frames / self.images
             told.append(
                 f"{self.frames} frames of a moving probe, whose errors stay alike for about "
-                f"{worth:.0f} frames (a lag between images and poses, or another depth setting?): "
-                f"they count as {self.images} image{'s' * (self.images != 1)}"
+                f"{worth:.0f} frames (a lag between images and poses, a slipped mount, or another "
+                f"depth setting?): they count as {self.images} image{'s' * (self.images != 1)}"
             )
         elif self.images < self.frames:
             told.append(

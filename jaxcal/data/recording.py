@@ -62,7 +62,7 @@ class Images:
         amplitude: (n,) received amplitude, arbitrary unit, or None.
         time: (n,) s, or None.
         spacing_mm: (2,) mm per px [lateral, axial] for pixels; None when unknown.
-        face_offset_mm: range of pixel row 0, mm.
+        face_offset_mm: range of pixel row 0, or of a measured range of 0, mm.
         time_of_flight: (n, elements) the times, s, that points were segmented from, or None.
         frame: (n,) number of each image's frame in the file that it came from, or None.
     """
@@ -254,7 +254,7 @@ def make_images(
         amplitude: (n,).
         time: (n,) s.
         spacing_mm: [lateral, axial] mm per px, pixels only.
-        face_offset_mm: range of pixel row 0, mm.
+        face_offset_mm: range of pixel row 0, or of a measured range of 0, mm; not with times.
         time_of_flight: (n, elements) s, points only: the times that they were segmented from.
         frame: (n,) numbers of the images' frames in the file that they came from.
         minimum: least number of used images (0 for a test set).
@@ -293,6 +293,8 @@ def make_images(
         checked = check_poses(poses, used)
         values = used_values(kind, values, used)
         spacing, face_mm = check_spacing(spacing_mm, kind), _face_offset(face_offset_mm)
+        if kind == "time_of_flight" and face_mm != 0:
+            raise InputError("face_offset_mm belongs to points and pixels; times have the delay_s")
         if kind == "pixel":
             _check_below_face(values, spacing, face_mm, used)
 

@@ -10,7 +10,8 @@
                  optional covariance (n, 2, 2) [mm^2, px^2 for pixels], amplitude (n,),
                  mask (n,) bool, time (n,) [s], max_elevation (n,) [mm],
                  frame (n,): numbers of the frames in the file that the images came from;
-                 pixel has attrs spacing_mm [lateral, axial] and face_offset_mm, both optional;
+                 pixel has attrs spacing_mm [lateral, axial] and face_offset_mm, both optional,
+                 point has face_offset_mm, optional;
                  optional attrs pose_from, pose_to: names of the poses' frames
     /test        optional, as /calibration
     /truth       optional; image_to_probe (4, 4), point (3,), elevation (n,) [mm]
@@ -252,7 +253,7 @@ def _read_images(root: Node, name: str, probe: Probe | None, minimum: int) -> Im
             f"{node}/time_of_flight has {times.shape[1]} columns, /probe has "
             f"{probe.elements} elements"
         )
-    spacing, offset = _read_scale(node) if kind == "pixel" else (None, None)
+    spacing, offset = _read_scale(node, kind)
     return make_images(
         poses,
         measurements,
@@ -260,7 +261,7 @@ def _read_images(root: Node, name: str, probe: Probe | None, minimum: int) -> Im
         mask=_dataset(node, "mask", (IMAGES,), _FREE, kinds="biu"),
         covariance=_dataset(node, "covariance", (IMAGES, 2, 2), _area(kind)),
         spacing_mm=spacing,
-        face_offset_mm=0.0 if offset is None else offset,
+        face_offset_mm=offset,
         time_of_flight=times if kind == "point" else None,
         minimum=minimum,
         where=str(node),
@@ -286,15 +287,16 @@ def _kind(node: Node) -> Kind:
     return found[0]
 
 
-def _read_scale(node: Node) -> tuple[np.ndarray | None, float | None]:
-    """Attributes spacing_mm and face_offset_mm of the pixels, or else of their group."""
-    pixels = child(node, "pixel")
-    owners = [node] if pixels is None else [pixels, node]
-    spacings = [numbers(owner, "spacing_mm", 2) for owner in owners]
+def _read_scale(node: Node, kind: Kind) -> tuple[np.ndarray | None, float]:
+    """Attributes spacing_mm (of pixels) and face_offset_mm of the measurements or their group."""
+    if kind == "time_of_flight":
+        return None, 0.0
+    owners = [owner for owner in (child(node, kind), node) if owner is not None]
+    spacings = [numbers(owner, "spacing_mm", 2) for owner in owners if kind == "pixel"]
     offsets = [number(owner, "face_offset_mm") for owner in owners]
     return (
         next((value for value in spacings if value is not None), None),
-        next((value for value in offsets if value is not None), None),
+        next((value for value in offsets if value is not None), 0.0),
     )
 
 
@@ -368,9 +370,9 @@ def _write(file: h5py.File, recording: Recording) -> None:
 def _write_images(target: h5py.Group, images: Images) -> None:
     _put(target, "pose", images.poses, "mm")
     measurements = _put(target, images.kind, images.measurements, UNIT_OF[images.kind])
-    if images.kind == "pixel":
-        if images.spacing_mm is not None:
-            measurements.attrs["spacing_mm"] = images.spacing_mm
+    if images.spacing_mm is not None:
+        measurements.attrs["spacing_mm"] = images.spacing_mm
+    if images.kind != "time_of_flight":
         measurements.attrs["face_offset_mm"] = images.face_offset_mm
     optional = {"time_of_flight": "s", "mask": _FREE, "covariance": _area(images.kind)}
     for name, unit in (optional | _PER_IMAGE).items():

@@ -241,7 +241,8 @@ def _unmodelled(answer: Calibration, grid: Float[np.ndarray, "m 2"]) -> dict[str
         "values": first.values,
         "statistic": first.statistic,
         "moved_mm": moved,
-        "slip_mm": slip if first.kind == "slip" else None,
+        "slip_mm": slip if first.kind in ("slip", "step") else None,
+        "image": first.image,
     }
 
 

@@ -144,6 +144,11 @@ def _from_unmodelled(record: dict[str, Any]) -> list[tuple[float, str]]:
             f"an image that moves by {found['slip_mm']:.1f} mm on the probe from the first image "
             "to the last would explain the errors far better: a slipping mount, or a moving target?"
         ),
+        "step": lambda: (
+            f"an image that moves by {found['slip_mm']:.1f} mm on the probe near image "
+            f"{found['image']} (counted from 0) would explain the errors far better: has the mount "
+            "slipped there, or the target moved? Calibrate from the images before it, or after it"
+        ),
         "skew": lambda: (
             f"lateral positions that are too large by {100 * values[0]:.1f} % of the depth would "
             "explain the errors far better: a steered beam, or clicks beside the target?"
