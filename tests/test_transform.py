@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import json
 import re
+import resource
 import signal
 import socket
 import subprocess
@@ -20,7 +21,7 @@ import numpy as np
 import pytest
 
 import jaxcal
-from jaxcal import FormatError, InputError
+from jaxcal import FormatError, InputError, OutputError
 from jaxcal.cli.main import main
 from jaxcal.data.poses import check_affine, quaternions_from_rotations, rotations_from_quaternions
 from jaxcal.io.itk import itk_from_matrix, itk_text, matrix_from_itk, read_itk, write_itk
@@ -339,6 +340,18 @@ def test_itk_files_by_itk(tmp_path, extension):
         for point in np.random.default_rng(0).normal(size=(5, 3)) * 50:
             stored = lps @ np.array(transform.TransformPoint((lps @ point).tolist()))
             np.testing.assert_allclose((found @ [*stored, 1])[:3], point, atol=1e-9)
+
+
+def test_itk_hdf5_on_a_full_disk(tmp_path):
+    path = tmp_path / "t.h5"
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
+    try:
+        with pytest.raises(OutputError, match=r"t\.h5: cannot be written: File too large"):
+            write_itk(path, np.eye(4))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(

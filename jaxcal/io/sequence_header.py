@@ -29,6 +29,8 @@ from jaxcal.runtime.messages import quoted
 MAXIMUM_HEADER = 64 * 2**20
 """Largest header, bytes: some 60,000 frames."""
 MOST_FRAMES = 100_000
+MOST_MATRICES = 1_000_000
+"""Of all transforms in all frames: 128 MB."""
 LARGEST_FRAME = 2**26
 """Most bytes of one frame."""
 
@@ -164,6 +166,11 @@ def sequence_of(
             if pair is None or not field_name.endswith("Transform"):
                 continue
             if pair not in transforms:
+                if (len(transforms) + 1) * count > MOST_MATRICES:
+                    raise FormatError(
+                        f"line {line}: more than {MOST_MATRICES // count} transforms in {count} "
+                        "frames"
+                    )
                 transforms[pair] = np.full((count, 4, 4), np.nan)
                 valid[pair] = np.zeros(count, bool)
             status = fields.get(f"{field_name}Status")
