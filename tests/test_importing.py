@@ -70,6 +70,8 @@ MATRIX = [f"m{i}{j}" for i in range(1, 4) for j in range(1, 5)]
         table(["u_px", "v_px", "tx_m", "ty_m", "tz_m", *NAMES[5:]],
               [PIXELS, TRANSLATIONS / 1e3, QUATERNIONS]),
         table([*NAMES[:5], "q0", "qx", "qy", "qz"], SCALAR_FIRST),
+        table([*NAMES[:2], "position.x", "position.y", "position.z", "orientation.x",
+               "orientation.y", "orientation.z", "orientation.w"], COLUMNS),
         table([*NAMES[:5], "w", "qx", "qy", "qz"], SCALAR_FIRST),
         table([*MATRIX, "u", "v"], [POSES[:, :3].reshape(6, 12), PIXELS]),
         table(["u", "v", *(f"p{k}" for k in range(16))], [PIXELS, POSES.reshape(6, 16)]),
@@ -531,6 +533,8 @@ def test_a_stated_unit_is_not_advised_against(tmp_path):
         ("x.npy", "save its numbers as a table"),
         ("results.xml", "jaxcal export, apply and compare read"),
         ("frame.png", "name the folder"),
+        ("clip.mp4", "save its frames as PNG"),
+        ("a.bag", "save its poses as a table"),
     ],
 )
 def test_what_to_do_with_other_files_is_told(tmp_path, name, told):

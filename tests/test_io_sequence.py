@@ -152,6 +152,8 @@ def test_an_orientation_that_is_not_known_is_no_unknown_one(tmp_path, name, stat
         (rb"DimSize = 4 6 5", b"DimSize = 4  6 5              "),
         (rb"Transform = ", b"Transform ="),
         (rb"(Seq_Frame0001_\w+Transform = [^\n]*)", rb"\1 "),
+        (rb"= LOCAL", b"= Local"),
+        (rb"= LOCAL", b"= local"),
         (rb"Seq_Frame0000_Timestamp", b"Seq_Frame0000_Stylus = 1 0 0\nSeq_Frame0000_Timestamp"),
     ],
 )  # fmt: skip
