@@ -610,7 +610,7 @@ def test_options_that_would_not_be_used(tmp_path, monkeypatch, sources, options,
 
 
 def test_points_of_images_that_were_not_ok(tmp_path):
-    frames = np.zeros((6, 60, 80), np.uint8)
+    frames = np.zeros((6, 500, 520), np.uint8)
     path = tmp_path / "s.igs.mha"
     write_sequence(path, {PROBE: POSES}, np.arange(6.0), images=frames)
     old = b"Seq_Frame0003_ImageStatus = "
@@ -623,10 +623,10 @@ def test_points_of_images_that_were_not_ok(tmp_path):
 
 @pytest.mark.parametrize(
     ("orientation", "told"),
-    [("MF", None), ("UF", "(u = 79 - u)"), ("UN", "(u = 79 - u and v = 59 - v)")],
+    [("MF", None), ("UF", "(u = 519 - u)"), ("UN", "(u = 519 - u and v = 499 - v)")],
 )
 def test_points_beside_pixels_of_another_orientation(tmp_path, orientation, told):
-    frames = np.zeros((6, 60, 80), np.uint8)
+    frames = np.zeros((6, 500, 520), np.uint8)
     path = tmp_path / "s.igs.mha"
     write_sequence(path, {PROBE: POSES}, np.arange(6.0), images=frames, orientation=orientation)
     (tmp_path / "p.csv").write_text(POINTS_OF_SIX)
@@ -640,6 +640,33 @@ def test_points_that_cannot_be_used_name_their_file(tmp_path, sequence):
     (tmp_path / "p.csv").write_text("\n".join(lines))
     with pytest.raises(InputError, match=r"s\.igs\.mha with .*p\.csv: pixel 0 has row"):
         import_files([sequence, tmp_path / "p.csv"])
+
+
+def test_points_outside_the_frames(tmp_path, capsys):
+    path, points, out = (str(tmp_path / name) for name in ("s.mha", "p.csv", "rec.h5"))
+    frames = np.zeros((6, 480, 640), np.uint8)
+    write_sequence(path, {PROBE: POSES}, np.arange(6.0), images=frames)
+
+    def imported(pixels):
+        rows = np.column_stack([np.arange(6), pixels])
+        np.savetxt(points, rows, delimiter=",", header="frame,u,v", comments="", fmt="%.6f")
+        return main(["import", path, points, out])
+
+    for pixels in (2 * PIXELS, PIXELS * [1.0, 3.0], PIXELS * [-1.0, 1.0]):
+        assert imported(pixels) == 2
+        assert "lies outside its frame of 640 x 480 px" in capsys.readouterr().err
+    # From 1 to the number of columns and rows, as MATLAB counts.
+    counted = np.minimum(PIXELS, 470.0)
+    counted[0] = 640.0, 480.0
+    assert imported(counted) == 0
+    images = jaxcal.load(out).calibration
+    assert images.frame_size == (640, 480)
+    # Pixels of other frames are not of the same image.
+    other = replace(images, frame_size=(640, 400))
+    with pytest.raises(InputError, match="its frames have 640 x 400, not 640 x 480 px"):
+        joined(jaxcal.Recording(images), jaxcal.Recording(other))
+    bare = jaxcal.Recording(replace(images, frame_size=None))
+    assert joined(bare, jaxcal.Recording(images)).calibration.frame_size == (640, 480)
 
 
 def test_points_off_the_plane(tmp_path, sequence):

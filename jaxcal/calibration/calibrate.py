@@ -92,7 +92,7 @@ class Request:
 
 
 def _taking_recordings(function: Callable[P, Calibration]) -> Callable[P, Calibration]:
-    """Decorate :func:`calibrate`: it takes recordings as well, and the answer knows their probe.
+    """Decorate :func:`calibrate`: of recordings, the answer knows probe and frame size.
 
     Placed outside ``in_own_modes``: to segment times of flight imports JAX, and what imports JAX
     within would run in the caller's modes.
@@ -101,8 +101,11 @@ def _taking_recordings(function: Callable[P, Calibration]) -> Callable[P, Calibr
     @wraps(function)
     def taking(problem: Problem | Recording | Images, *args: Any, **kwargs: Any) -> Calibration:
         found = function(as_problem(problem, "jaxcal.calibrate"), *args, **kwargs)  # pyright: ignore[reportCallIssue]
-        probe = problem.probe if isinstance(problem, Recording) else None
-        return found if probe is None else replace(found, probe=probe)
+        if isinstance(problem, Recording):
+            found, problem = replace(found, probe=problem.probe), problem.calibration
+        return (
+            replace(found, frame_size=problem.frame_size) if isinstance(problem, Images) else found
+        )
 
     return taking  # pyright: ignore[reportReturnType]
 

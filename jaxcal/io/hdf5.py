@@ -10,7 +10,8 @@
                  optional covariance (n, 2, 2) [mm^2, px^2 for pixels], amplitude (n,),
                  mask (n,) bool, time (n,) [s], max_elevation (n,) [mm],
                  frame (n,): numbers of the frames in the file that the images came from;
-                 pixel has attrs spacing_mm [lateral, axial] and face_offset_mm, both optional;
+                 pixel has attrs spacing_mm [lateral, axial], face_offset_mm and frame_size
+                 [columns, rows], all optional;
                  optional attrs pose_from, pose_to: names of the poses' frames
     /test        optional, as /calibration
     /truth       optional; image_to_probe (4, 4), point (3,), elevation (n,) [mm]
@@ -252,7 +253,7 @@ def _read_images(root: Node, name: str, probe: Probe | None, minimum: int) -> Im
             f"{node}/time_of_flight has {times.shape[1]} columns, /probe has "
             f"{probe.elements} elements"
         )
-    spacing, offset = _read_scale(node) if kind == "pixel" else (None, None)
+    spacing, offset, size = _read_scale(node) if kind == "pixel" else (None, None, None)
     return make_images(
         poses,
         measurements,
@@ -261,6 +262,7 @@ def _read_images(root: Node, name: str, probe: Probe | None, minimum: int) -> Im
         covariance=_dataset(node, "covariance", (IMAGES, 2, 2), _area(kind)),
         spacing_mm=spacing,
         face_offset_mm=0.0 if offset is None else offset,
+        frame_size=size,
         time_of_flight=times if kind == "point" else None,
         minimum=minimum,
         where=str(node),
@@ -286,15 +288,17 @@ def _kind(node: Node) -> Kind:
     return found[0]
 
 
-def _read_scale(node: Node) -> tuple[np.ndarray | None, float | None]:
-    """Attributes spacing_mm and face_offset_mm of the pixels, or else of their group."""
+def _read_scale(node: Node) -> tuple[np.ndarray | None, float | None, np.ndarray | None]:
+    """Attributes spacing_mm, face_offset_mm, frame_size of the pixels, or else of their group."""
     pixels = child(node, "pixel")
     owners = [node] if pixels is None else [pixels, node]
     spacings = [numbers(owner, "spacing_mm", 2) for owner in owners]
     offsets = [number(owner, "face_offset_mm") for owner in owners]
+    sizes = [numbers(owner, "frame_size", 2) for owner in owners]
     return (
         next((value for value in spacings if value is not None), None),
         next((value for value in offsets if value is not None), None),
+        next((value for value in sizes if value is not None), None),
     )
 
 
@@ -372,6 +376,8 @@ def _write_images(target: h5py.Group, images: Images) -> None:
         if images.spacing_mm is not None:
             measurements.attrs["spacing_mm"] = images.spacing_mm
         measurements.attrs["face_offset_mm"] = images.face_offset_mm
+        if images.frame_size is not None:
+            measurements.attrs["frame_size"] = images.frame_size
     optional = {"time_of_flight": "s", "mask": _FREE, "covariance": _area(images.kind)}
     for name, unit in (optional | _PER_IMAGE).items():
         values = getattr(images, name)
