@@ -16,6 +16,7 @@ import jaxcal
 from jaxcal import FormatError, InputError
 from jaxcal.cli.main import main
 from jaxcal.data.recording import joined
+from jaxcal.io import slicer
 from jaxcal.io.columns import columns_of_header
 from jaxcal.io.importing import import_files
 from jaxcal.io.sequence_files import read_sequence, write_sequence
@@ -640,6 +641,15 @@ def test_points_that_cannot_be_used_name_their_file(tmp_path, sequence):
     (tmp_path / "p.csv").write_text("\n".join(lines))
     with pytest.raises(InputError, match=r"s\.igs\.mha with .*p\.csv: pixel 0 has row"):
         import_files([sequence, tmp_path / "p.csv"])
+
+
+def test_points_of_slicer_are_bounded(tmp_path, monkeypatch):
+    monkeypatch.setattr(slicer, "MOST_POINTS", 3)
+    (tmp_path / "p.fcsv").write_text("a,1,2,0\n" * 3)
+    assert len(read_markups(tmp_path / "p.fcsv").positions) == 3
+    (tmp_path / "p.fcsv").write_text("a,1,2,0\n" * 4)
+    with pytest.raises(FormatError, match=r"p\.fcsv:4: more than 3 points"):
+        read_markups(tmp_path / "p.fcsv")
 
 
 def test_points_outside_the_frames(tmp_path, capsys):

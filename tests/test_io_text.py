@@ -252,6 +252,13 @@ def test_too_large_a_file_is_not_read(tmp_path):
         read_csv(path)
 
 
+def test_a_line_of_too_many_cells_is_not_read(tmp_path):
+    path = tmp_path / "table.csv"
+    path.write_text("u,v\n" + "1," * (text_files.LONGEST_LINE // 2) + "1\n")
+    with pytest.raises(FormatError, match=r"table\.csv:2: is longer than 1048576 characters"):
+        read_csv(path)
+
+
 def test_a_table_of_too_many_rows_is_not_read(tmp_path, monkeypatch):
     path = tmp_path / "table.csv"
     monkeypatch.setattr(table, "MOST_ROWS", 3)

@@ -26,6 +26,7 @@ from jaxcal.runtime.messages import quoted
 _LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 _KIND = "AffineTransform_double_3_3"
 _HEAD = "#Insight Transform File V1.0"
+_FIELDS = ("Transform", "Parameters", "FixedParameters")
 _AFFINE = ("AffineTransform", "MatrixOffsetTransformBase")
 
 
@@ -159,6 +160,8 @@ def _read_text(path: str | os.PathLike[str]) -> tuple[str, np.ndarray, np.ndarra
         if content.startswith("#"):
             continue
         key, _, value = content.partition(":")
+        if key not in _FIELDS:
+            continue
         if key in fields:
             raise FormatError(f"line {line}: a second {quoted(key)}; one transform is read")
         fields[key] = value.strip()
