@@ -788,7 +788,7 @@ def test_import_calibrate_export(tmp_path, capsys):
     """The documented path, and its answer against the truth."""
     truth = burnt_sequence(tmp_path / "x.igs.mha")
     config = tmp_path / "config.xml"
-    old = ' <Transform From="Image" To="UsProbe" Matrix="1 0 0 0  0 1 0 0  0 0 1 0  0 0 0 1" />'
+    old = ' <Transform From="Image" To="US_Probe" Matrix="1 0 0 0  0 1 0 0  0 0 1 0  0 0 0 1" />'
     lines = ["<PlusConfiguration>", "<CoordinateDefinitions>", old, "</CoordinateDefinitions>"]
     config.write_bytes("\r\n".join([*lines, "</PlusConfiguration>", ""]).encode())
     recording = str(tmp_path / "out.h5")
@@ -799,7 +799,7 @@ def test_import_calibrate_export(tmp_path, capsys):
     assert 24 <= int(re.search(r"out\.h5: (\d+) images, pixels", said)[1]) <= 27
     assert "1 of 28 frames left out: their tracking was not OK" in said
     # The probe's marker has another name in this laboratory, in the recording as in PLUS.
-    named = replace(jaxcal.load(recording), pose_frames=("UsProbe", "Tracker"))
+    named = replace(jaxcal.load(recording), pose_frames=("US_Probe", "Tracker"))
     jaxcal.save(named, recording)
     arguments = ["--method", "conventional", "--estimate", "scale", "--json"]
     exported = ["--export", f"plus:{config}", "--export", f"slicer:{tmp_path / 'x.tfm'}"]
@@ -807,20 +807,20 @@ def test_import_calibrate_export(tmp_path, capsys):
     (tmp_path / "cal.json").write_text(capsys.readouterr().out)
     found = jaxcal.load_calibration(tmp_path / "cal.json")
     slicer = jaxcal.load_calibration(tmp_path / "x.tfm").plus_matrix()
-    assert jaxcal.load_calibration(config).probe_frame == "UsProbe"
+    assert jaxcal.load_calibration(config).probe_frame == "US_Probe"
     assert main(["export", str(tmp_path / "cal.json"), str(tmp_path / "t.xml"), "--plus"]) == 0
     assert main(["export", str(config), str(tmp_path / "t.xml"), "--plus"]) == 0
     alone = jaxcal.load_calibration(tmp_path / "t.xml").plus_matrix()
     for matrix in (jaxcal.load_calibration(config).plus_matrix(), alone, slicer):
         np.testing.assert_allclose(matrix, found.plus_matrix(), rtol=0, atol=1e-11)
     assert config.read_text().count("<Transform ") == 1
-    for arguments, frame in (([], "UsProbe"), (["--probe-frame", "Wand"], "Wand")):
+    for arguments, frame in (([], "US_Probe"), (["--probe-frame", "Wand"], "Wand")):
         assert main(["export", str(tmp_path / "cal.json"), "--plus", *arguments]) == 0
         assert f'From="Image" To="{frame}"' in capsys.readouterr().out
     found.save(tmp_path / "again.json")
-    assert jaxcal.load_calibration(tmp_path / "again.json").probe_frame == "UsProbe"
+    assert jaxcal.load_calibration(tmp_path / "again.json").probe_frame == "US_Probe"
     record = json.loads((tmp_path / "cal.json").read_text())
-    assert record["exported"][0] == f"{config}: Image to UsProbe written"
+    assert record["exported"][0] == f"{config}: Image to US_Probe written"
     assert record["exported"][-1] == f"{tmp_path / 'x.tfm'}: written"
     np.testing.assert_allclose(record["plus_image_to_probe"], found.plus_matrix(), atol=1e-12)
     # The error of X in its own frame, X Exp(d), against the stated covariance.

@@ -302,7 +302,9 @@ def test_frame_names():
     assert path_between([("A", "B"), ("C", "B")], "A", "C") == [(0, False), (1, True)]
     assert path_between([("A", "B")], "A", "C") is None
     assert check_frames(("image", "probe")) == ("Image", "Probe")
-    for name in ("", "a b", "ProbeToTracker", "1x", 'x"y'):
+    assert split_name("US_ProbeTo_Tracker-1") == ("US_Probe", "_Tracker-1")
+    assert check_frames(("US_Probe", "Probe-2")) == ("US_Probe", "Probe-2")
+    for name in ("", "a b", "ProbeToTracker", "1x", 'x"y', "GoTo", "ToA", "GoTo_A"):
         with pytest.raises(FormatError):
             check_frames((name, "Other"))
 
