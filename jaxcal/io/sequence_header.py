@@ -33,6 +33,8 @@ MOST_MATRICES = 1_000_000
 """Of all transforms in all frames: 128 MB."""
 LARGEST_FRAME = 2**26
 """Most bytes of one frame."""
+_MOST_INTERLEAVED = 2**29
+"""Most bytes of frames that cannot be read one by one."""
 
 _LONGEST_LINE = 2**16
 _FRAME_FIELD = re.compile(r"Seq_Frame(\d{1,18})_(.+)", re.DOTALL)
@@ -101,6 +103,11 @@ def checked_pixels(pixels: Pixels, count: int) -> Pixels:
         raise FormatError(
             f"a frame of {pixels.columns} x {pixels.rows} pixels is larger than "
             f"{LARGEST_FRAME} bytes"
+        )
+    if pixels.interleaved and pixels.frame_bytes * count > _MOST_INTERLEAVED:
+        raise FormatError(
+            "lists its frames along the first axis, and is too large to be read at once: list "
+            "them along the last one"
         )
     # Opening the stream compares the size with the file.
     with PixelStream(pixels.path, pixels.start, pixels.packing, pixels.frame_bytes * count):
