@@ -15,6 +15,7 @@ from conftest import experiment
 from rich.console import Console
 
 import jaxcal
+from jaxcal import design
 from jaxcal.calibration.resampling import relative_twist
 from jaxcal.cli.main import main
 from jaxcal.data.recording import Recording, make_images
@@ -39,6 +40,7 @@ from jaxcal.model.unknowns import (
 from jaxcal.report.accuracy import FAIR_MM, GOOD_MM, region_of, settle
 from jaxcal.report.next_poses import next_poses_sentences
 from jaxcal.report.record import _precision, calibration_record
+from jaxcal.report.summary import record_of, recording_of
 from jaxcal.report.tables import calibration_table
 from jaxcal.report.verdict import headline, limits, verdict
 from jaxcal.result.saved import load_calibration
@@ -84,6 +86,28 @@ def test_quantiles_of_an_error_against_draws(variances, freedom):
     for chance in (0.025, 0.5, 0.975):
         found = length_quantile(np.array([variances]), freedom, chance)[0]
         assert np.mean(length < found) == pytest.approx(chance, abs=0.002)
+
+
+def test_places_stay_in_the_frame(recording, result):
+    """Corners, the map and the places of further images; the answer in memory says the same."""
+    recording = replace(recording, probe=None)
+    images = recording.calibration
+    size = tuple(int(last) + 2 for last in images.measurements.max(axis=0))
+
+    def places(record):
+        return np.array([point["image"] for point in record["tre"]["points"]])
+
+    assert (places(calibration_record(result, recording)).max(axis=0) > size).all()
+    framed = replace(recording, calibration=replace(images, frame_size=size))
+    answer = jaxcal.calibrate(framed, "conventional", estimate=("scale",))
+    found = calibration_record(answer, framed)
+    last = np.array(size) - 1.0
+    np.testing.assert_allclose(places(found).max(axis=0), last)
+    assert record_of(answer)["tre"] == found["tre"]
+    assert region_of(answer.numpy(), recording_of(answer)) == region_of(answer.numpy(), framed)
+    region = design.candidates_around(framed, answer, count=16).constraints.region
+    ends = np.array([region.lateral_mm[1], region.depth_mm[1]])
+    np.testing.assert_allclose(ends / answer.scale_mm_per_px, last)
 
 
 @pytest.mark.parametrize("pixels", [True, False])

@@ -598,6 +598,23 @@ def test_the_region_of_pixels_has_no_negative_columns():
     assert seen_region(in_px, targets).lateral_mm == (0.0, 8.0)
 
 
+def test_the_region_of_pixels_ends_with_the_frame():
+    targets = np.array([[1.0, 0.0, 6.0], [5.0, 0.0, 12.0]])
+    poses, pixels = np.tile(np.eye(4), (4, 1, 1)), np.ones((4, 2))
+    transform = jaxcal.ImageTransform(np.eye(4), np.array([0.1, 0.2]), 1.0, range_factor=0.5)
+
+    def ends(size):
+        images = make_images(poses, pixels, "pixel", frame_size=size)
+        region = seen_region(Recording(images), targets, transform)
+        return region.lateral_mm[1], region.depth_mm[1]
+
+    assert ends(None) == ends((1000, 1000)) == (8.0, 15.0)
+    # The centre of the last pixel, at the estimated sound speed, from the range of row 0.
+    np.testing.assert_allclose(ends((61, 131)), (6.0, 14.0))
+    # A target that was seen is inside whatever the frame's size says.
+    assert ends((11, 11)) == (5.0, 12.0)
+
+
 @pytest.mark.parametrize("count", [4, 10])
 def test_the_figure_is_a_figure(tmp_path, count):
     plan = design.plan(some(200), count)

@@ -135,6 +135,18 @@ def told(tmp_path_factory):
     table(folder / "in" / "back.csv", times=[0, 1, 2, 2, 3])
     for name, message in (("mixed", "different units"), ("back", "is not later than the one")):
         add(name, message, "import", str(folder / "in" / f"{name}.csv"), str(folder / f"{name}.h5"))
+    lost = b"Seq_Frame0000_A%dToBTransform = 0\nSeq_Frame0000_A%dToBTransformStatus = INVALID\n"
+    poses = b"".join(lost % (k, k) for k in range(100))
+    hostile("transforms", "more than 10 transforms in 100000 frames",
+            swap(rb"DimSize = 1 1 5", b"DimSize = 0 0 100000\n" + poses))  # fmt: skip
+    tools = ",".join(f"Port {k},State,Q0,Qx,Qy,Qz,Tx,Ty,Tz" for k in range(3000))
+    (folder / "in" / "tools.csv").write_text(f"Tools,{tools}\n" + "3\n" * 100_000)
+    add("tools", "more than 1000000 poses of 3000 tools", "import",
+        str(folder / "in" / "tools.csv"), str(folder / "tools.h5"))  # fmt: skip
+    wide = ",".join(f"c{k}" for k in range(100_000))
+    (folder / "in" / "blank.csv").write_text(f"{wide}\n" + ",\n" * 2000 + "1\n")
+    add("blank", "1 columns, the header has 100000", "import", str(folder / "in" / "blank.csv"),
+        str(folder / "blank.h5"))  # fmt: skip
     (folder / "in" / "laughs.xml").write_text(entities())
     add("laughs", "document types", "export", str(folder / "in" / "laughs.xml"), "--slicer",
         str(folder / "laughs.tfm"))  # fmt: skip
@@ -156,7 +168,8 @@ def told(tmp_path_factory):
 
 @pytest.mark.parametrize("name", [
     "passwd", "parent", "nrrd-parent", "ten-gigabytes", "frames", "zlib", "fifteen", "nan",
-    "reflected", "duplicate", "unordered", "mixed", "back", "laughs", "png", "deep",
+    "reflected", "duplicate", "unordered", "mixed", "back", "laughs", "png", "deep", "transforms",
+    "tools", "blank",
 ])  # fmt: skip
 def test_hostile(told, name):
     code, error, growth, message = told[name]

@@ -16,6 +16,7 @@ import jaxcal
 from jaxcal import FormatError, InputError
 from jaxcal.cli.main import main
 from jaxcal.data.recording import joined
+from jaxcal.io import slicer
 from jaxcal.io.columns import columns_of_header
 from jaxcal.io.importing import import_files
 from jaxcal.io.sequence_files import read_sequence, write_sequence
@@ -70,6 +71,8 @@ MATRIX = [f"m{i}{j}" for i in range(1, 4) for j in range(1, 5)]
         table(["u_px", "v_px", "tx_m", "ty_m", "tz_m", *NAMES[5:]],
               [PIXELS, TRANSLATIONS / 1e3, QUATERNIONS]),
         table([*NAMES[:5], "q0", "qx", "qy", "qz"], SCALAR_FIRST),
+        table([*NAMES[:2], "position.x", "position.y", "position.z", "orientation.x",
+               "orientation.y", "orientation.z", "orientation.w"], COLUMNS),
         table([*NAMES[:5], "w", "qx", "qy", "qz"], SCALAR_FIRST),
         table([*MATRIX, "u", "v"], [POSES[:, :3].reshape(6, 12), PIXELS]),
         table(["u", "v", *(f"p{k}" for k in range(16))], [PIXELS, POSES.reshape(6, 16)]),
@@ -531,6 +534,8 @@ def test_a_stated_unit_is_not_advised_against(tmp_path):
         ("x.npy", "save its numbers as a table"),
         ("results.xml", "jaxcal export, apply and compare read"),
         ("frame.png", "name the folder"),
+        ("clip.mp4", "save its frames as PNG"),
+        ("a.bag", "save its poses as a table"),
     ],
 )
 def test_what_to_do_with_other_files_is_told(tmp_path, name, told):
@@ -606,7 +611,7 @@ def test_options_that_would_not_be_used(tmp_path, monkeypatch, sources, options,
 
 
 def test_points_of_images_that_were_not_ok(tmp_path):
-    frames = np.zeros((6, 60, 80), np.uint8)
+    frames = np.zeros((6, 500, 520), np.uint8)
     path = tmp_path / "s.igs.mha"
     write_sequence(path, {PROBE: POSES}, np.arange(6.0), images=frames)
     old = b"Seq_Frame0003_ImageStatus = "
@@ -619,10 +624,10 @@ def test_points_of_images_that_were_not_ok(tmp_path):
 
 @pytest.mark.parametrize(
     ("orientation", "told"),
-    [("MF", None), ("UF", "(u = 79 - u)"), ("UN", "(u = 79 - u and v = 59 - v)")],
+    [("MF", None), ("UF", "(u = 519 - u)"), ("UN", "(u = 519 - u and v = 499 - v)")],
 )
 def test_points_beside_pixels_of_another_orientation(tmp_path, orientation, told):
-    frames = np.zeros((6, 60, 80), np.uint8)
+    frames = np.zeros((6, 500, 520), np.uint8)
     path = tmp_path / "s.igs.mha"
     write_sequence(path, {PROBE: POSES}, np.arange(6.0), images=frames, orientation=orientation)
     (tmp_path / "p.csv").write_text(POINTS_OF_SIX)
@@ -636,6 +641,42 @@ def test_points_that_cannot_be_used_name_their_file(tmp_path, sequence):
     (tmp_path / "p.csv").write_text("\n".join(lines))
     with pytest.raises(InputError, match=r"s\.igs\.mha with .*p\.csv: pixel 0 has row"):
         import_files([sequence, tmp_path / "p.csv"])
+
+
+def test_points_of_slicer_are_bounded(tmp_path, monkeypatch):
+    monkeypatch.setattr(slicer, "MOST_POINTS", 3)
+    (tmp_path / "p.fcsv").write_text("a,1,2,0\n" * 3)
+    assert len(read_markups(tmp_path / "p.fcsv").positions) == 3
+    (tmp_path / "p.fcsv").write_text("a,1,2,0\n" * 4)
+    with pytest.raises(FormatError, match=r"p\.fcsv:4: more than 3 points"):
+        read_markups(tmp_path / "p.fcsv")
+
+
+def test_points_outside_the_frames(tmp_path, capsys):
+    path, points, out = (str(tmp_path / name) for name in ("s.mha", "p.csv", "rec.h5"))
+    frames = np.zeros((6, 480, 640), np.uint8)
+    write_sequence(path, {PROBE: POSES}, np.arange(6.0), images=frames)
+
+    def imported(pixels):
+        rows = np.column_stack([np.arange(6), pixels])
+        np.savetxt(points, rows, delimiter=",", header="frame,u,v", comments="", fmt="%.6f")
+        return main(["import", path, points, out])
+
+    for pixels in (2 * PIXELS, PIXELS * [1.0, 3.0], PIXELS * [-1.0, 1.0]):
+        assert imported(pixels) == 2
+        assert "lies outside its frame of 640 x 480 px" in capsys.readouterr().err
+    # From 1 to the number of columns and rows, as MATLAB counts.
+    counted = np.minimum(PIXELS, 470.0)
+    counted[0] = 640.0, 480.0
+    assert imported(counted) == 0
+    images = jaxcal.load(out).calibration
+    assert images.frame_size == (640, 480)
+    # Pixels of other frames are not of the same image.
+    other = replace(images, frame_size=(640, 400))
+    with pytest.raises(InputError, match="its frames have 640 x 400, not 640 x 480 px"):
+        joined(jaxcal.Recording(images), jaxcal.Recording(other))
+    bare = jaxcal.Recording(replace(images, frame_size=None))
+    assert joined(bare, jaxcal.Recording(images)).calibration.frame_size == (640, 480)
 
 
 def test_points_off_the_plane(tmp_path, sequence):
@@ -747,7 +788,7 @@ def test_import_calibrate_export(tmp_path, capsys):
     """The documented path, and its answer against the truth."""
     truth = burnt_sequence(tmp_path / "x.igs.mha")
     config = tmp_path / "config.xml"
-    old = ' <Transform From="Image" To="UsProbe" Matrix="1 0 0 0  0 1 0 0  0 0 1 0  0 0 0 1" />'
+    old = ' <Transform From="Image" To="US_Probe" Matrix="1 0 0 0  0 1 0 0  0 0 1 0  0 0 0 1" />'
     lines = ["<PlusConfiguration>", "<CoordinateDefinitions>", old, "</CoordinateDefinitions>"]
     config.write_bytes("\r\n".join([*lines, "</PlusConfiguration>", ""]).encode())
     recording = str(tmp_path / "out.h5")
@@ -758,7 +799,7 @@ def test_import_calibrate_export(tmp_path, capsys):
     assert 24 <= int(re.search(r"out\.h5: (\d+) images, pixels", said)[1]) <= 27
     assert "1 of 28 frames left out: their tracking was not OK" in said
     # The probe's marker has another name in this laboratory, in the recording as in PLUS.
-    named = replace(jaxcal.load(recording), pose_frames=("UsProbe", "Tracker"))
+    named = replace(jaxcal.load(recording), pose_frames=("US_Probe", "Tracker"))
     jaxcal.save(named, recording)
     arguments = ["--method", "conventional", "--estimate", "scale", "--json"]
     exported = ["--export", f"plus:{config}", "--export", f"slicer:{tmp_path / 'x.tfm'}"]
@@ -766,20 +807,20 @@ def test_import_calibrate_export(tmp_path, capsys):
     (tmp_path / "cal.json").write_text(capsys.readouterr().out)
     found = jaxcal.load_calibration(tmp_path / "cal.json")
     slicer = jaxcal.load_calibration(tmp_path / "x.tfm").plus_matrix()
-    assert jaxcal.load_calibration(config).probe_frame == "UsProbe"
+    assert jaxcal.load_calibration(config).probe_frame == "US_Probe"
     assert main(["export", str(tmp_path / "cal.json"), str(tmp_path / "t.xml"), "--plus"]) == 0
     assert main(["export", str(config), str(tmp_path / "t.xml"), "--plus"]) == 0
     alone = jaxcal.load_calibration(tmp_path / "t.xml").plus_matrix()
     for matrix in (jaxcal.load_calibration(config).plus_matrix(), alone, slicer):
         np.testing.assert_allclose(matrix, found.plus_matrix(), rtol=0, atol=1e-11)
     assert config.read_text().count("<Transform ") == 1
-    for arguments, frame in (([], "UsProbe"), (["--probe-frame", "Wand"], "Wand")):
+    for arguments, frame in (([], "US_Probe"), (["--probe-frame", "Wand"], "Wand")):
         assert main(["export", str(tmp_path / "cal.json"), "--plus", *arguments]) == 0
         assert f'From="Image" To="{frame}"' in capsys.readouterr().out
     found.save(tmp_path / "again.json")
-    assert jaxcal.load_calibration(tmp_path / "again.json").probe_frame == "UsProbe"
+    assert jaxcal.load_calibration(tmp_path / "again.json").probe_frame == "US_Probe"
     record = json.loads((tmp_path / "cal.json").read_text())
-    assert record["exported"][0] == f"{config}: Image to UsProbe written"
+    assert record["exported"][0] == f"{config}: Image to US_Probe written"
     assert record["exported"][-1] == f"{tmp_path / 'x.tfm'}: written"
     np.testing.assert_allclose(record["plus_image_to_probe"], found.plus_matrix(), atol=1e-12)
     # The error of X in its own frame, X Exp(d), against the stated covariance.

@@ -57,7 +57,7 @@ def random_images(generator, kind, count, optional, elements=8):
         "time": np.sort(generator.uniform(0, 60, count)),
     }
     if kind == "pixel":
-        values["spacing_mm"] = generator.uniform(0.05, 0.3, 2)
+        values |= {"spacing_mm": generator.uniform(0.05, 0.3, 2), "frame_size": (640, 640)}
     if kind != "time_of_flight":
         values["face_offset_mm"] = 1.25
     chosen = {name: value for name, value in values.items() if name in optional}
@@ -135,7 +135,7 @@ def refused(path, message, error=FormatError):
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(["point", "pixel", "time_of_flight"]),
     count=st.integers(4, 12),
-    optional=st.sets(st.sampled_from([*OPTIONAL, "spacing_mm", "face_offset_mm"])),
+    optional=st.sets(st.sampled_from([*OPTIONAL, "spacing_mm", "face_offset_mm", "frame_size"])),
     parts=st.sets(st.sampled_from(["test", "truth"])),
 )
 def test_round_trip(tmp_path_factory, seed, kind, count, optional, parts):
@@ -562,6 +562,11 @@ def test_contradicting_measurements(path):
         ("spacing_mm", [0.1, -0.1], "two positive numbers"),
         ("spacing_mm", [0.1, np.nan], "two positive numbers"),
         ("face_offset_mm", np.nan, "face_offset_mm must be finite"),
+        ("frame_size", [640, 0], "frame_size must be two whole numbers"),
+        ("frame_size", [640.5, 480], "frame_size must be two whole numbers"),
+        ("frame_size", [np.nan, 480], "frame_size must be two whole numbers"),
+        ("frame_size", [10, 10], "lies outside its frame of 10 x 10 px"),
+        ("frame_size", 640, "attribute frame_size must be a number, 2 of it"),
         ("face_offset_mm", [1.0, 2.0], "attribute face_offset_mm must be a number"),
     ],
 )

@@ -122,6 +122,33 @@ def test_a_transform_that_is_not_valid(tmp_path, mark, capsys):
     assert jaxcal.load_calibration(path).scale_mm_per_px is not None
 
 
+def test_transforms_are_inverted_and_chained_as_plus_does(tmp_path):
+    path, moved = tmp_path / "c.xml", np.eye(4)
+    moved[:3, 3] = 1.0, -2.0, 3.0
+
+    def put(source, target, matrix):
+        numbers = " ".join(map(repr, matrix.ravel().tolist()))
+        return f'<Transform From="{source}" To="{target}" Matrix="{numbers}" Error="0.5"/>'
+
+    inverse = put("Probe", "Image", np.linalg.inv(MATRIX))
+    chain = (
+        put("Image", "Transducer", np.linalg.inv(moved) @ MATRIX),
+        put("Transducer", "Probe", moved),
+    )
+    for elements, error_mm in (((OTHER, inverse), 0.5), (chain, None), (chain[::-1], None)):
+        path.write_bytes(configuration(*elements))
+        found = read_transform(path)
+        np.testing.assert_allclose(found.matrix, MATRIX, rtol=0, atol=1e-12)
+        assert found[1:] == (error_mm, "Probe")
+    # Where no way leads to the probe, the only frame that is reached is taken.
+    path.write_bytes(configuration(chain[0]))
+    assert read_transform(path).target == "Transducer"
+    for elements in ((OLD, put("Image", "Probe", MATRIX)), (OLD, inverse), (*chain, chain[1])):
+        path.write_bytes(configuration(*elements))
+        with pytest.raises(FormatError, match=r"2 transforms between .* remove the others"):
+            read_transform(path)
+
+
 def transforms(content):
     (place,) = parse_xml(content).all("CoordinateDefinitions")
     return [each for each in place.children if each.tag in ("Transform", "transform")]

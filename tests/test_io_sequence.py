@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import re
 import subprocess
 import sys
@@ -12,6 +13,7 @@ import pytest
 
 from jaxcal import FormatError, InputError
 from jaxcal.data.poses import rotations_from_quaternions
+from jaxcal.io import sequence_header
 from jaxcal.io.frame_names import check_frames, path_between, split_name
 from jaxcal.io.sequence_files import read_sequence, write_sequence
 
@@ -152,6 +154,8 @@ def test_an_orientation_that_is_not_known_is_no_unknown_one(tmp_path, name, stat
         (rb"DimSize = 4 6 5", b"DimSize = 4  6 5              "),
         (rb"Transform = ", b"Transform ="),
         (rb"(Seq_Frame0001_\w+Transform = [^\n]*)", rb"\1 "),
+        (rb"= LOCAL", b"= Local"),
+        (rb"= LOCAL", b"= local"),
         (rb"Seq_Frame0000_Timestamp", b"Seq_Frame0000_Stylus = 1 0 0\nSeq_Frame0000_Timestamp"),
     ],
 )  # fmt: skip
@@ -300,7 +304,9 @@ def test_frame_names():
     assert path_between([("A", "B"), ("C", "B")], "A", "C") == [(0, False), (1, True)]
     assert path_between([("A", "B")], "A", "C") is None
     assert check_frames(("image", "probe")) == ("Image", "Probe")
-    for name in ("", "a b", "ProbeToTracker", "1x", 'x"y'):
+    assert split_name("US_ProbeTo_Tracker-1") == ("US_Probe", "_Tracker-1")
+    assert check_frames(("US_Probe", "Probe-2")) == ("US_Probe", "Probe-2")
+    for name in ("", "a b", "ProbeToTracker", "1x", 'x"y', "GoTo", "ToA", "GoTo_A"):
         with pytest.raises(FormatError):
             check_frames((name, "Other"))
 
@@ -392,6 +398,36 @@ def test_times_of_slicers_volume_sequences(tmp_path, named, times):
                 read_sequence(tmp_path / "a.seq.nrrd")
 
 
+@pytest.mark.parametrize("packed", [False, True])
+def test_frames_along_the_first_axis(tmp_path, monkeypatch, packed):
+    """As Slicer documents its volume sequences: the numbers of all frames, pixel by pixel."""
+    path, frames = tmp_path / "a.seq.nrrd", np.arange(5 * 6 * 4, dtype=">i2").reshape(5, 6, 4)
+    head = [
+        "NRRD0005",
+        "type: short",
+        "dimension: 4",
+        "sizes: 5 4 6 1",
+        "kinds: list domain domain domain",
+        'labels: "time" "" "" ""',
+        "endian: big",
+        f"encoding: {'gzip' if packed else 'raw'}",
+        "axis 0 index type:=numeric",
+        "axis 0 index values:=0 0.1 0.2 0.3 0.5",
+        "DataNodeClassName:=vtkMRMLScalarVolumeNode",
+    ]
+    content = frames.transpose(1, 2, 0).tobytes()
+    content = gzip.compress(content) if packed else content
+    path.write_bytes("\n".join([*head, "", ""]).encode() + content)
+    found = read_sequence(path)
+    np.testing.assert_array_equal(found.time, [0, 0.1, 0.2, 0.3, 0.5])
+    np.testing.assert_array_equal(list(found.images(orientation="MF")), frames)
+    wanted = list(found.images([1, 4], orientation="UN"))
+    np.testing.assert_array_equal(wanted, frames[[1, 4], ::-1, ::-1])
+    monkeypatch.setattr(sequence_header, "_MOST_INTERLEAVED", 100)
+    with pytest.raises(FormatError, match="list them along the last one"):
+        read_sequence(path)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
@@ -399,7 +435,7 @@ def test_times_of_slicers_volume_sequences(tmp_path, named, times):
         (rb"encoding: gzip", b"encoding: bzip2", "encoding 'bzip2' is not read"),
         (rb"sizes: 4 6 5", b"sizes: 4 6 2147483648", "claims 2147483648 frames"),
         (rb"sizes: 4 6 5", b"sizes: 100000 100000 1000", "larger than"),
-        (rb"kinds: domain domain list", b"kinds: list domain domain", "no sequence of plane"),
+        (rb"kinds: domain domain list", b"kinds: domain list domain", "no sequence of plane"),
         (rb"kinds: domain domain list", b"kinds: domain domain", "3 sizes, but 2 kinds"),
         (rb"type: uint8", b"type: block", "type 'block' is not read"),
         (rb"NRRD0004", b"NRRX0004", "is not an NRRD file"),

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from jaxcal import FormatError, InputError
 from jaxcal.io import lines as text_files
+from jaxcal.io import table
 from jaxcal.io.text import read_crosswire, read_pose_table, recording_of
 
 CROSSWIRE = Path(__file__).parents[2] / "shared" / "data" / "crosswire"
@@ -249,6 +250,23 @@ def test_too_large_a_file_is_not_read(tmp_path):
         file.truncate(text_files.MAXIMUM_BYTES + 1)
     with pytest.raises(FormatError, match="too large"):
         read_csv(path)
+
+
+def test_a_line_of_too_many_cells_is_not_read(tmp_path):
+    path = tmp_path / "table.csv"
+    path.write_text("u,v\n" + "1," * (text_files.LONGEST_LINE // 2) + "1\n")
+    with pytest.raises(FormatError, match=r"table\.csv:2: is longer than 1048576 characters"):
+        read_csv(path)
+
+
+def test_a_table_of_too_many_rows_is_not_read(tmp_path, monkeypatch):
+    path = tmp_path / "table.csv"
+    monkeypatch.setattr(table, "MOST_ROWS", 3)
+    path.write_text("u,v\n" + "1,2\n" * 3)
+    assert len(read_pose_table(path)) == 3
+    path.write_text("u,v\n" + "1,2\n" * 4)
+    with pytest.raises(FormatError, match=r"table\.csv:5: more than 3 rows"):
+        read_pose_table(path)
 
 
 def test_missing_directory_and_device(tmp_path):

@@ -5,8 +5,10 @@ from __future__ import annotations
 import datetime
 import json
 import re
+import resource
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import threading
@@ -18,9 +20,10 @@ import h5py
 import jaxtyping
 import numpy as np
 import pytest
+from fastcrc import crc64
 
 import jaxcal
-from jaxcal import FormatError, InputError
+from jaxcal import FormatError, InputError, OutputError
 from jaxcal.cli.main import main
 from jaxcal.data.poses import check_affine, quaternions_from_rotations, rotations_from_quaternions
 from jaxcal.io.itk import itk_from_matrix, itk_text, matrix_from_itk, read_itk, write_itk
@@ -339,6 +342,18 @@ def test_itk_files_by_itk(tmp_path, extension):
         for point in np.random.default_rng(0).normal(size=(5, 3)) * 50:
             stored = lps @ np.array(transform.TransformPoint((lps @ point).tolist()))
             np.testing.assert_allclose((found @ [*stored, 1])[:3], point, atol=1e-9)
+
+
+def test_itk_hdf5_on_a_full_disk(tmp_path):
+    path = tmp_path / "t.h5"
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
+    try:
+        with pytest.raises(OutputError, match=r"t\.h5: cannot be written: File too large"):
+            write_itk(path, np.eye(4))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(
@@ -755,6 +770,31 @@ def test_set_in_a_running_plus_server(saved, capsys, status):
     numbers = re.search(r'TransformValue="([^"]*)"', received[0].string)[1].split()
     sent = np.array(numbers, float).reshape(4, 4)
     np.testing.assert_allclose(sent, random_transform().plus_matrix(), atol=1e-12)
+
+
+def test_a_plus_servers_reply_of_header_version_2(saved, capsys):
+    """An extended header before the text, metadata after it."""
+    text = b'<CommandReply Status="SUCCESS" Message="said"/>'
+    content = struct.pack(">HH", 3, len(text)) + text
+    metadata = struct.pack(">HHHI", 1, 1, 3, 1) + b"ab"
+    body = struct.pack(">HHII", 12, 10, 2, 7) + content + metadata
+
+    def serve(listener):
+        link, _ = listener.accept()
+        with link:
+            device = link.recv(1 << 16)[14:34].replace(b"CMD", b"ACK")
+            head = struct.pack(">H12s20sIIQQ", 2, b"STRING", device, 0, 0, len(body),
+                               crc64.ecma_182(body))  # fmt: skip
+            link.sendall(head + body)
+            link.recv(1 << 16)
+
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        thread = threading.Thread(target=serve, args=(listener,))
+        thread.start()
+        port = listener.getsockname()[1]
+        assert main(["export", str(saved), "--plus-server", f"127.0.0.1:{port}"]) == 0
+        thread.join()
+    assert "Image to Probe set; said" in capsys.readouterr().out
 
 
 def test_no_plus_server(saved, capsys):

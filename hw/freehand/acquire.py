@@ -95,9 +95,11 @@ class _Run(Run):
         self._guide, self._spacing_mm = guide, spacing_mm
 
     def begin(self) -> None:
-        """Record the frames of the poses, and the size of the pixels."""
+        """Record the frames of the poses, and the sizes of images and pixels."""
         source, target = self._posed.pair
-        self._recorder.attributes("calibration", {"pose_from": source, "pose_to": target})
+        rows, columns = self._posed.shape
+        known = {"pose_from": source, "pose_to": target, "frame_size": [columns, rows]}
+        self._recorder.attributes("calibration", known)
         if self._asked.spacing_mm is not None:
             self._recorder.attributes("calibration", {"spacing_mm": list(self._asked.spacing_mm)})
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import errno
 import hashlib
+import io
 import os
 import secrets
 import shutil
@@ -94,8 +95,11 @@ class RecordingWriter:
         final = check_new(path)
         temporary = final.parent / f".partial-{secrets.token_hex(8)}{final.suffix}"
         try:
-            with h5py.File(temporary, "w") as file:
+            # Built in memory: HDF5 crashes on a full disk.
+            image = io.BytesIO()
+            with h5py.File(image, "w") as file:
                 _write_skeleton(file, header)
+            temporary.write_bytes(image.getvalue())
             # Not os.replace: somebody may have made the file in the meantime.
             os.link(temporary, final)
         except FileExistsError:

@@ -175,8 +175,9 @@ def calibrate(
     )
     # Not in own modes: segmenting times of flight imports JAX, whose modes are entered after that.
     found = _calibrated(as_problem(problem, "jaxcal.calibrate"), request)
-    probe = problem.probe if isinstance(problem, Recording) else None
-    return found if probe is None else replace(found, probe=probe)
+    if isinstance(problem, Recording):
+        found, problem = replace(found, probe=problem.probe), problem.calibration
+    return replace(found, frame_size=problem.frame_size) if isinstance(problem, Images) else found
 
 
 @in_own_modes

@@ -65,6 +65,7 @@ class Images:
         face_offset_mm: range of pixel row 0, or of a measured range of 0, mm.
         time_of_flight: (n, elements) the times, s, that points were segmented from, or None.
         frame: (n,) number of each image's frame in the file that it came from, or None.
+        frame_size: (columns, rows) of the frames, px, for pixels; None when unknown.
     """
 
     poses: Float[np.ndarray, "n 4 4"]
@@ -79,6 +80,7 @@ class Images:
     face_offset_mm: float = 0.0
     time_of_flight: Float[np.ndarray, "n elements"] | None = None
     frame: Int[np.ndarray, " n"] | None = None
+    frame_size: tuple[int, int] | None = None
 
     def __len__(self) -> int:
         return len(self.poses)
@@ -181,6 +183,10 @@ def joined(first: Recording, second: Recording) -> Recording:
             f"{where}: their pixels must be of one size, known in both recordings or in neither "
             "(--spacing states it)"
         )
+    if a.frame_size and b.frame_size and a.frame_size != b.frame_size:
+        # Of another depth or cut: a pixel's size or origin is another one, too.
+        told = ", not ".join("{} x {}".format(*size) for size in (b.frame_size, a.frame_size))
+        raise InputError(f"{where}: its frames have {told} px")
     if None not in (first.probe, second.probe) and first.probe != second.probe:
         raise InputError(f"{where}: their probes differ")
     frames = [each.pose_frames for each in (first, second)]
@@ -196,7 +202,11 @@ def joined(first: Recording, second: Recording) -> Recording:
     names += ("time", "time_of_flight", "frame")
     return replace(
         first,
-        calibration=replace(a, **{name: both(name) for name in names}),
+        calibration=replace(
+            a,
+            **{name: both(name) for name in names},
+            frame_size=a.frame_size or b.frame_size,
+        ),
         truth=None,
         probe=first.probe or second.probe,
         source=f"{first.source} with {second.source}",
@@ -239,6 +249,7 @@ def make_images(
     face_offset_mm: float = 0.0,
     time_of_flight: np.ndarray | None = None,
     frame: np.ndarray | None = None,
+    frame_size: Any = None,
     minimum: int = MINIMUM_IMAGES,
     where: str = "",
 ) -> Images:
@@ -257,6 +268,7 @@ def make_images(
         face_offset_mm: range of pixel row 0, or of a measured range of 0, mm; not with times.
         time_of_flight: (n, elements) s, points only: the times that they were segmented from.
         frame: (n,) numbers of the images' frames in the file that they came from.
+        frame_size: (columns, rows) of the frames, px, pixels only.
         minimum: least number of used images (0 for a test set).
         where: prefix of error messages, e.g. a file's name.
 
@@ -295,8 +307,11 @@ def make_images(
         spacing, face_mm = check_spacing(spacing_mm, kind), _face_offset(face_offset_mm)
         if kind == "time_of_flight" and face_mm != 0:
             raise InputError("face_offset_mm belongs to points and pixels; times have the delay_s")
+        size = _frame_size(frame_size, kind)
         if kind == "pixel":
             _check_below_face(values, spacing, face_mm, used)
+        if size is not None:
+            _check_inside(values, size, used)
 
         images = Images(
             poses=checked,
@@ -311,6 +326,7 @@ def make_images(
             face_offset_mm=face_mm,
             time_of_flight=_raw_times(time_of_flight, kind, count, used),
             frame=_frame(frame, count),
+            frame_size=size,
         )
         _check_units(images)
         return images
@@ -408,6 +424,29 @@ def _check_below_face(
         "has a range that is not positive: its row lies at or above the transducer's face "
         "(face_offset_mm is the range of row 0)",
     )
+
+
+def _frame_size(frame_size: Any, kind: Kind) -> tuple[int, int] | None:
+    if frame_size is None:
+        return None
+    size = real_array(frame_size, "frame_size")
+    if size.shape != (2,) or not ((size >= 1) & (size <= LARGEST) & (size % 1 == 0)).all():
+        raise InputError("frame_size must be two whole numbers of px [columns, rows]")
+    if kind != "pixel":
+        raise InputError(f"frame_size belongs to pixels, not to {kind} data")
+    return int(size[0]), int(size[1])
+
+
+def _check_inside(pixels: np.ndarray, size: tuple[int, int], used: np.ndarray) -> None:
+    """Every used pixel lies in the frame, or beside it by a pixel if they are counted from 1."""
+    inside = ((pixels >= -1) & (pixels <= size)).all(axis=1)
+    first = np.flatnonzero(used & ~inside)
+    if len(first):
+        u, v = pixels[first[0]]
+        raise InputError(
+            f"pixel {first[0]}, u = {u:g}, v = {v:g}, lies outside its frame of {size[0]} x "
+            f"{size[1]} px: are u and v exchanged, or of an enlarged or a cut image?"
+        )
 
 
 def _bound(max_elevation: Any, count: int, used: np.ndarray) -> Float[np.ndarray, " n"] | None:

@@ -25,6 +25,7 @@ from jaxcal.runtime.given_values import LARGEST_SEED, check_made, whole_number
 if TYPE_CHECKING:
     from jaxcal.data.recording import Recording
     from jaxcal.result.calibration import Calibration
+    from jaxcal.result.transform import ImageTransform
 
 COUNT = 5000
 """Number of candidates of a plan; twice as many change the predicted error by less than 1 %."""
@@ -270,7 +271,11 @@ def candidates_around(
         images = poses[used, :3, :3] @ x[:3, :3]
         reference, _ = nearest_rotations(images.mean(axis=0)[None])
         constraints = Constraints(
-            region=seen_region(recording, targets[used]) if region is None else region,
+            region=(
+                seen_region(recording, targets[used], answer.image_transform())
+                if region is None
+                else region
+            ),
             reference=reference[0],
         )
         seen = constraints.coordinates(poses[used], x, point)
@@ -285,8 +290,16 @@ def candidates_around(
     return Candidates(found, model, constraints, poses, used)
 
 
-def seen_region(recording: Recording, targets: Float[np.ndarray, "n 3"]) -> Region:
-    """Where the target was, slightly enlarged; at least most of the face of a known probe."""
+def seen_region(
+    recording: Recording,
+    targets: Float[np.ndarray, "n 3"],
+    transform: ImageTransform | None = None,
+) -> Region:
+    """Where the target was, slightly enlarged; at least most of the face of a known probe.
+
+    If the size of the frames is known, and by ``transform`` that of a pixel, the region does not go
+    beyond the last column and row.
+    """
     probe = recording.probe
     whole = Region() if probe is None else Region.of_probe(probe)
     if probe is not None and whole.radius_mm is not None:
@@ -303,5 +316,11 @@ def seen_region(recording: Recording, targets: Float[np.ndarray, "n 3"]) -> Regi
         lateral = (min(left, whole.lateral_mm[0]), max(right, whole.lateral_mm[1]))
     if recording.calibration.kind == "pixel":  # an image has no columns below 0
         lateral = (max(lateral[0], min(left, 0.0)), lateral[1])
+    size = recording.calibration.frame_size
+    if size is not None and transform is not None and transform.scale_mm_per_px is not None:
+        pixel = transform.scale_mm_per_px * [1.0, transform.range_factor]
+        column, row = pixel * (np.array(size) - 1.0) + [0.0, transform.face_offset_mm]
+        lateral = (lateral[0], min(lateral[1], max(right, column)))
+        depth = (depth[0], min(depth[1], max(far, row)))
     depth = (min(depth), max(depth))
     return Region(tuple(map(float, lateral)), tuple(map(float, depth)))  # pyright: ignore[reportArgumentType]

@@ -31,10 +31,10 @@ _NAMES = {
     "x": ("x", "tx", "px", "posx", "positionx", "translationx"),
     "y": ("y", "ty", "py", "posy", "positiony", "translationy"),
     "z": ("z", "tz", "pz", "posz", "positionz", "translationz"),
-    "qx": ("qx", "quaternionx", "rotationx"),
-    "qy": ("qy", "quaterniony", "rotationy"),
-    "qz": ("qz", "quaternionz", "rotationz"),
-    "qw": ("qw", "qs", "quaternionw", "rotationw", "w"),
+    "qx": ("qx", "quatx", "quaternionx", "rotationx", "orientationx"),
+    "qy": ("qy", "quaty", "quaterniony", "rotationy", "orientationy"),
+    "qz": ("qz", "quatz", "quaternionz", "rotationz", "orientationz"),
+    "qw": ("qw", "qs", "quatw", "quaternionw", "rotationw", "orientationw", "w"),
 }
 _ROLE = {name: role for role, names in _NAMES.items() for name in names}
 _UNIT = re.compile(

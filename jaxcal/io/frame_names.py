@@ -10,7 +10,7 @@ from jaxcal.runtime.messages import quoted, shown
 FramePair = tuple[str, str]
 """(from, to): the transform takes coordinates of the first frame to the second."""
 
-_SEPARATOR = re.compile(r"(?<=.)To(?=[A-Z0-9])")
+_SEPARATOR = re.compile(r"(?<=.)To(?=[A-Z0-9_-])")
 
 
 def split_name(name: str) -> FramePair | None:
@@ -46,16 +46,18 @@ def check_frames(frames: FramePair) -> FramePair:
 
     Raises:
         InputError: not two texts.
-        FormatError: a name that is not letters and digits after a first letter, or in which "To"
-            stands before a capital letter: ``ProbeToTracker`` could not be split again; or one
-            frame twice.
+        FormatError: a name that is not letters, digits, _ and - after a first letter, or in which
+            "To" stands at the end or before anything but a small letter: ``ProbeToTracker`` could
+            not be split again; or one frame twice.
     """
     source, target = map(capitalised, two_names(frames))
     for name, capital in zip(frames, (source, target), strict=True):
-        if not re.fullmatch(r"[A-Za-z][A-Za-z0-9]*", name) or _SEPARATOR.search(capital):
+        # PLUS joins the names, and counts a "To" at the beginning or the end, too.
+        split = _SEPARATOR.search(f"X{capital}X")
+        if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_-]*", name) or split:
             raise FormatError(
-                f"{quoted(name)} cannot name a coordinate frame: letters and digits are needed, "
-                'without "To" before a capital letter'
+                f"{quoted(name)} cannot name a coordinate frame: letters, digits, _ and - are "
+                'needed, without "To" at the end or before a capital letter'
             )
     if source == target:
         raise FormatError(

@@ -10,8 +10,8 @@
                  optional covariance (n, 2, 2) [mm^2, px^2 for pixels], amplitude (n,),
                  mask (n,) bool, time (n,) [s], max_elevation (n,) [mm],
                  frame (n,): numbers of the frames in the file that the images came from;
-                 pixel has attrs spacing_mm [lateral, axial] and face_offset_mm, both optional,
-                 point has face_offset_mm, optional;
+                 pixel has attrs spacing_mm [lateral, axial], face_offset_mm and frame_size
+                 [columns, rows], point has face_offset_mm, all optional;
                  optional attrs pose_from, pose_to: names of the poses' frames
     /test        optional, as /calibration
     /truth       optional; image_to_probe (4, 4), point (3,), elevation (n,) [mm]
@@ -253,7 +253,7 @@ def _read_images(root: Node, name: str, probe: Probe | None, minimum: int) -> Im
             f"{node}/time_of_flight has {times.shape[1]} columns, /probe has "
             f"{probe.elements} elements"
         )
-    spacing, offset = _read_scale(node, kind)
+    spacing, offset, size = _read_scale(node, kind)
     return make_images(
         poses,
         measurements,
@@ -262,6 +262,7 @@ def _read_images(root: Node, name: str, probe: Probe | None, minimum: int) -> Im
         covariance=_dataset(node, "covariance", (IMAGES, 2, 2), _area(kind)),
         spacing_mm=spacing,
         face_offset_mm=offset,
+        frame_size=size,
         time_of_flight=times if kind == "point" else None,
         minimum=minimum,
         where=str(node),
@@ -287,16 +288,19 @@ def _kind(node: Node) -> Kind:
     return found[0]
 
 
-def _read_scale(node: Node, kind: Kind) -> tuple[np.ndarray | None, float]:
-    """Attributes spacing_mm (of pixels) and face_offset_mm of the measurements or their group."""
+def _read_scale(node: Node, kind: Kind) -> tuple[np.ndarray | None, float, np.ndarray | None]:
+    """Attributes spacing_mm, face_offset_mm, frame_size of the measurements or of their group."""
     if kind == "time_of_flight":
-        return None, 0.0
+        return None, 0.0, None
     owners = [owner for owner in (child(node, kind), node) if owner is not None]
-    spacings = [numbers(owner, "spacing_mm", 2) for owner in owners if kind == "pixel"]
+    pixels = owners if kind == "pixel" else []
+    spacings = [numbers(owner, "spacing_mm", 2) for owner in pixels]
     offsets = [number(owner, "face_offset_mm") for owner in owners]
+    sizes = [numbers(owner, "frame_size", 2) for owner in pixels]
     return (
         next((value for value in spacings if value is not None), None),
         next((value for value in offsets if value is not None), 0.0),
+        next((value for value in sizes if value is not None), None),
     )
 
 
@@ -374,6 +378,8 @@ def _write_images(target: h5py.Group, images: Images) -> None:
         measurements.attrs["spacing_mm"] = images.spacing_mm
     if images.kind != "time_of_flight":
         measurements.attrs["face_offset_mm"] = images.face_offset_mm
+        if images.frame_size is not None:
+            measurements.attrs["frame_size"] = images.frame_size
     optional = {"time_of_flight": "s", "mask": _FREE, "covariance": _area(images.kind)}
     for name, unit in (optional | _PER_IMAGE).items():
         values = getattr(images, name)

@@ -171,6 +171,8 @@ def _from_sequence(
                 lambda row: f"{sequence.source}: {sequence.frame_name(int(used.rows[row]))}",
                 options,
             )
+        pixels = sequence.pixels
+        size = None if pixels is None else (pixels.columns, pixels.rows)
         images = make_images(
             poses[used.rows],
             used.points,
@@ -179,6 +181,7 @@ def _from_sequence(
             time=time,
             spacing_mm=spacing,
             frame=sequence.numbers_of(used.rows),
+            frame_size=size if used.kind == "pixel" else None,
             minimum=options.minimum,
             where=where,
         )

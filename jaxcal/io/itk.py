@@ -7,6 +7,7 @@ as A = L inverse(M) L. Poses in sequences and OpenIGTLink messages are *not* cha
 
 from __future__ import annotations
 
+import io
 import os
 from pathlib import Path
 
@@ -15,7 +16,7 @@ import numpy as np
 
 from jaxcal import FormatError, InputError
 from jaxcal.data.poses import check_affine, rotations_from_quaternions
-from jaxcal.io.atomic import atomic_path, write_text
+from jaxcal.io.atomic import write_bytes, write_text
 from jaxcal.io.given_files import check_readable, naming
 from jaxcal.io.lines import text_lines
 from jaxcal.io.untrusted import Node, UpTo, array, child, group, open_root, string
@@ -25,6 +26,7 @@ from jaxcal.runtime.messages import quoted
 _LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 _KIND = "AffineTransform_double_3_3"
 _HEAD = "#Insight Transform File V1.0"
+_FIELDS = ("Transform", "Parameters", "FixedParameters")
 _AFFINE = ("AffineTransform", "MatrixOffsetTransformBase")
 
 
@@ -117,7 +119,9 @@ def write_itk(path: str | os.PathLike[str], matrix: Float[np.ndarray, "4 4"]) ->
     parameters = itk_from_matrix(matrix)
     # ITK cannot read h5py's default character set, UTF-8.
     ascii_text = h5py.string_dtype("ascii")
-    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+    # Built in memory: HDF5 crashes on a full disk.
+    content = io.BytesIO()
+    with h5py.File(content, "w") as file:
         for key, value in (
             ("ITKVersion", "5.4.0"),
             ("HDFVersion", h5py.version.hdf5_version),
@@ -128,6 +132,7 @@ def write_itk(path: str | os.PathLike[str], matrix: Float[np.ndarray, "4 4"]) ->
             file.create_dataset(key, data=[value], dtype=ascii_text)
         file["TransformGroup/0/TransformParameters"] = parameters
         file["TransformGroup/0/TransformFixedParameters"] = np.zeros(3)
+    write_bytes(path, content.getvalue())
 
 
 def read_itk(path: str | os.PathLike[str]) -> Float[np.ndarray, "4 4"]:
@@ -155,6 +160,8 @@ def _read_text(path: str | os.PathLike[str]) -> tuple[str, np.ndarray, np.ndarra
         if content.startswith("#"):
             continue
         key, _, value = content.partition(":")
+        if key not in _FIELDS:
+            continue
         if key in fields:
             raise FormatError(f"line {line}: a second {quoted(key)}; one transform is read")
         fields[key] = value.strip()

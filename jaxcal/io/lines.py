@@ -17,6 +17,8 @@ HDF5_BEGINNING = b"\x89HDF\r\n\x1a\n"
 """How a file of HDF5 begins."""
 MAXIMUM_BYTES = 64 * 2**20
 """Largest text file that is read."""
+LONGEST_LINE = 2**20
+"""Most characters of a line: a million cells would take a gigabyte."""
 
 
 def text_lines(
@@ -30,7 +32,8 @@ def text_lines(
             formula failed (``#N/A``) begins no comment.
 
     Raises:
-        FormatError: cannot be read, too large, not text; one line with path and line.
+        FormatError: cannot be read, too large, not text, a line of over :data:`LONGEST_LINE`
+            characters; one line with path and line.
     """
     name = os.fspath(path)
     content = read_bytes(path, MAXIMUM_BYTES)
@@ -47,5 +50,7 @@ def text_lines(
     del content
     # Not splitlines: it also breaks at form feeds and the like, where editors count no new line.
     for number, line in enumerate(io.StringIO(text, newline=None), start=1):
+        if len(line) > LONGEST_LINE:
+            raise FormatError(f"{name}:{number}: is longer than {LONGEST_LINE} characters")
         if line.strip() and (comments or not _COMMENT.match(line)):
             yield number, line.rstrip("\n")

@@ -32,6 +32,9 @@ _META_TYPES = {
     "MET_DOUBLE": np.dtype("f8"),
 }
 
+_LOCAL = ("LOCAL", "Local", "local")
+"""Names of the file of the pixels that MetaIO takes for the header's own."""
+
 
 def read_metaimage(path: Path, name: str) -> TrackedSequence:
     """Read a header; its errors do not name the file."""
@@ -82,9 +85,10 @@ def _metaimage_pixels(
     big = _flag(fields, "BinaryDataByteOrderMSB", "ElementByteOrderMSB")
     dtype = _META_TYPES[fields["ElementType"]].newbyteorder(">" if big else "<")
     data = fields["ElementDataFile"]
+    data = "" if data in _LOCAL else data
     pixels = Pixels(
-        path if data == "LOCAL" else _beside(path, data),
-        header.end if data == "LOCAL" else 0,
+        _beside(path, data) if data else path,
+        0 if data else header.end,
         "zlib" if _flag(fields, "CompressedData") else "raw",
         columns,
         rows,
@@ -115,7 +119,7 @@ def _flag(fields: dict[str, str], *names: str, default: bool = False) -> bool:
 
 def _after_header(stated: str, data: str, pixels: Pixels, count: int) -> int:
     """Where pixels begin in their file, by HeaderSize: -1 says that they are its end."""
-    if data == "LOCAL":
+    if not data:
         raise FormatError(
             f"HeaderSize = {quoted(stated)}: applies only to pixels in another file, but these "
             "follow the header: remove the line"

@@ -70,6 +70,9 @@ def read_nrrd(path: Path, name: str) -> TrackedSequence:
     pixels = None
     if columns > 1 and rows > 1:
         pixels = _nrrd_pixels(path, header, (columns, rows, channels), count)
+        # As Slicer documents its volume sequences; it may also list the frames along the last axis.
+        if fields.get("kinds", "").startswith("list"):
+            pixels = checked_pixels(replace(pixels, interleaved=True), count)
     found = sequence_of(header, count, pixels, "Status", name)
     if not np.isfinite(found.time).any() and (time := _index_times(fields, count)) is not None:
         return replace(found, time=time)
@@ -82,7 +85,7 @@ def _index_times(fields: dict[str, str], count: int) -> np.ndarray | None:
     Slicer calls them values of the index of the axis that lists the images. An index may also be
     something else than time: it counts only if its unit or its name says so.
     """
-    axis = len(fields["sizes"].split()) - 1
+    axis = 0 if fields.get("kinds", "").startswith("list") else len(fields["sizes"].split()) - 1
     values = fields.get(f"axis {axis} index values", fields.get("axis 0 index values"))
     if values is None:
         return None
@@ -116,6 +119,8 @@ def _nrrd_size(fields: dict[str, str]) -> tuple[int, int, int, int]:
     plane = [size for size, kind in zip(sizes, kinds, strict=True) if kind in ("domain", "space")]
     listed = [size for size, kind in zip(sizes, kinds, strict=True) if kind in ("list", "time")]
     others = kinds[0] in ("vector", "RGB-color", "RGBA-color", "3-color", "4-color")
+    if kinds[0] == "list":
+        kinds = [*kinds[1:], "list"]
     regular = kinds[others:] == ["domain"] * len(plane) + kinds[len(kinds) - len(listed) :]
     # Without a list axis the third one counts the frames.
     if len(plane) == 3 and not listed:

@@ -170,7 +170,7 @@ def decode_body(header: Header, body: bytes, t_host: float = math.nan) -> Messag
     Raises:
         ContentError: sizes that do not agree, or an image of a kind that is not accepted.
     """
-    content, metadata, message_id = _content_bytes(header, body)
+    content, metadata, message_id = content_bytes(header, body)
     found: Content = None
     match header.kind:
         case "IMAGE":
@@ -186,8 +186,12 @@ def decode_body(header: Header, body: bytes, t_host: float = math.nan) -> Messag
     return Message(header.kind, header.device, header.t_device, found, message_id, t_host)
 
 
-def _content_bytes(header: Header, body: bytes) -> tuple[memoryview, dict[str, str], int]:
-    """Content, metadata and message id."""
+def content_bytes(header: Header, body: bytes) -> tuple[memoryview, dict[str, str], int]:
+    """Content, metadata and message id of a body.
+
+    Raises:
+        ContentError: sizes that do not agree.
+    """
     view = memoryview(body)
     if header.version == 1:
         return view, {}, 0

@@ -51,13 +51,14 @@ def read_transform(
 ) -> PlusTransform:
     """Read the transform between two frames; the file is not trusted.
 
-    It is a configuration, an fCal result, or a Transform element alone. If no target is named, it
-    is ``Probe``, or the only frame of another name to which a transform leads from the source
-    (the transducer's own frames do not count).
+    It is a configuration, an fCal result, or a Transform element alone. As in PLUS, transforms may
+    be inverted and chained. If no target is named, it is ``Probe``, or the only frame of another
+    name to which a transform leads from the source (the transducer's own frames do not count).
 
     Raises:
         FormatError: not such a file, a DTD, a transform that is not 16 finite numbers, no such
-            transform, or one that is marked as not valid; one line with path and line.
+            transform, several between the same frames, or one that is marked as not valid; one line
+            with path and line.
     """
     root, _ = read_xml(path)
     wanted = capitalised(source), capitalised(target or "Probe")
@@ -71,19 +72,25 @@ def read_transform(
             _check_root(root)
             elements = [each for place in root.all(_COORDINATES) for each in _transforms(place)]
         # All are looked at: a file with a damaged transform is not to be trusted.
-        stated = [(_matrix(e), _frames(e), _optional_number(e, "Error"), e) for e in elements]
-        ends = {to for _, (start, to), *_ in stated if start == wanted[0]}
+        stated = [(_matrix(e), _frames(e), _optional_number(e, "Error")) for e in elements]
+        pairs = [frames for _, frames, _ in stated]
+        ends = {to for start, to in pairs if start == wanted[0]}
         ends = {to for to in ends if not to.startswith("TransducerOrigin")}
-        if target is None and len(ends) == 1:
+        if target is None and path_between(pairs, *wanted) is None and len(ends) == 1:
             wanted = wanted[0], *ends
-        for matrix, frames, error_mm, element in stated:
-            if frames == wanted:
-                _check_status(element)
-                if of_result:
-                    errors = root.first("ErrorReport/ReprojectionError3DStatistics")
-                    error_mm = _optional_number(errors, "CalibrationMeanMm")
-                return PlusTransform(matrix, error_mm, frames[1])
-        raise FormatError(f"holds no transform from {' to '.join(wanted)}")
+        way = path_between(pairs, *wanted)
+        if not way:
+            raise FormatError(f"holds no transform from {' to '.join(wanted)}")
+        total, error_mm = np.eye(4), None
+        for index, inverted in way:
+            _between(elements, pairs[index])
+            _check_status(elements[index])
+            matrix, _, error_mm = stated[index]
+            total = (np.linalg.inv(check_affine(matrix)) if inverted else matrix) @ total
+        if of_result:
+            errors = root.first("ErrorReport/ReprojectionError3DStatistics")
+            error_mm = _optional_number(errors, "CalibrationMeanMm")
+        return PlusTransform(total, error_mm if len(way) == 1 else None, wanted[1])
 
 
 def _check_root(root: Element) -> None:
@@ -94,6 +101,18 @@ def _check_root(root: Element) -> None:
 def _transforms(coordinates: Element) -> list[Element]:
     """Its transforms; PLUS compares their tag without regard to case."""
     return [element for element in coordinates.children if element.tag.lower() == "transform"]
+
+
+def _between(elements: list[Element], frames: FramePair) -> list[Element]:
+    """The transform between two frames, in either direction; PLUS takes no second one."""
+    between = [element for element in elements if set(_frames(element)) == set(frames)]
+    if len(between) > 1:
+        lines = " and ".join(str(element.line) for element in between)
+        raise FormatError(
+            f"lines {lines}: {len(between)} transforms between {frames[0]} and {frames[1]}; PLUS "
+            "takes one: remove the others"
+        )
+    return between
 
 
 def _matrix(element: Element) -> Float[np.ndarray, "4 4"]:
@@ -230,13 +249,7 @@ def _replaced(
             "the transforms together"
         )
     elements = _transforms(places[0]) if places else []
-    between = [element for element in elements if set(_frames(element)) == set(wanted)]
-    if len(between) > 1:
-        lines = " and ".join(str(element.line) for element in between)
-        raise FormatError(
-            f"lines {lines}: {len(between)} transforms between {wanted[0]} and {wanted[1]}; PLUS "
-            "takes one: remove the others"
-        )
+    between = _between(elements, wanted)
     _check_other_paths([element for element in elements if element not in between], wanted)
     newline = "\r\n" if b"\r\n" in content else "\n"
 

@@ -20,7 +20,15 @@ from numpy import ndarray
 from jaxcal import FormatError, InputError
 from jaxcal.io.frame_names import FramePair
 from jaxcal.io.given_files import one_line
-from jaxcal.io.openigtlink import HEADER_SIZE, PORT, Message, encode_header, parse_header
+from jaxcal.io.message_content import ContentError
+from jaxcal.io.openigtlink import (
+    HEADER_SIZE,
+    PORT,
+    Message,
+    content_bytes,
+    encode_header,
+    parse_header,
+)
 from jaxcal.io.plus import update_transform_command
 from jaxcal.io.xml import parse_xml
 from jaxcal.runtime.array_types import Float
@@ -69,7 +77,7 @@ def update_transform(
 
 
 def _reply(link: socket.socket, device: str, due: float) -> bytes:
-    """The body of the message from a device; other messages are discarded."""
+    """The content of the message from a device; other messages are discarded."""
     while True:
         header = parse_header(_take(link, HEADER_SIZE, due))
         if header is None:
@@ -79,7 +87,10 @@ def _reply(link: socket.socket, device: str, due: float) -> bytes:
             body = _take(link, header.size, due)
             if crc64.ecma_182(body) != header.crc:
                 raise InputError("the reply was damaged in transmission")
-            return body
+            try:
+                return bytes(content_bytes(header, body)[0])
+            except ContentError as error:
+                raise InputError(f"the reply is {error}") from None
         left = header.size
         while left:
             left -= len(_take(link, min(left, 1 << 16), due))

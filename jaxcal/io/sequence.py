@@ -43,6 +43,7 @@ class Pixels:
         dtype: of one number.
         orientation: of the stored pixels; None where the file does not say.
         kind: ``BRIGHTNESS`` for B-mode; PLUS's other types are RF data.
+        interleaved: for each pixel the numbers of all frames, as 3D Slicer may write them.
     """
 
     path: Path
@@ -54,6 +55,7 @@ class Pixels:
     dtype: np.dtype
     orientation: Orientation | None
     kind: str = "BRIGHTNESS"
+    interleaved: bool = False
 
     @property
     def frame_bytes(self) -> int:
@@ -263,6 +265,13 @@ class TrackedSequence:
             naming(self.source),
             PixelStream(pixels.path, pixels.start, pixels.packing, size * len(self)) as stream,
         ):
+            if pixels.interleaved:
+                content = np.frombuffer(stream.read_at(0, size * len(self)), pixels.dtype)
+                stream.check_end()
+                frames = content.reshape(pixels.rows, pixels.columns, len(self))
+                for number in numbers:
+                    yield oriented(np.ascontiguousarray(frames[:, :, number]), stored)
+                return
             for number in numbers:
                 frame = np.frombuffer(stream.read_at(number * size, size), pixels.dtype)
                 frame = frame.reshape(pixels.rows, pixels.columns, pixels.channels)

@@ -29,8 +29,12 @@ from jaxcal.runtime.messages import quoted
 MAXIMUM_HEADER = 64 * 2**20
 """Largest header, bytes: some 60,000 frames."""
 MOST_FRAMES = 100_000
+MOST_MATRICES = 1_000_000
+"""Of all transforms in all frames: 128 MB."""
 LARGEST_FRAME = 2**26
 """Most bytes of one frame."""
+_MOST_INTERLEAVED = 2**29
+"""Most bytes of frames that cannot be read one by one."""
 
 _LONGEST_LINE = 2**16
 _FRAME_FIELD = re.compile(r"Seq_Frame(\d{1,18})_(.+)", re.DOTALL)
@@ -100,6 +104,11 @@ def checked_pixels(pixels: Pixels, count: int) -> Pixels:
             f"a frame of {pixels.columns} x {pixels.rows} pixels is larger than "
             f"{LARGEST_FRAME} bytes"
         )
+    if pixels.interleaved and pixels.frame_bytes * count > _MOST_INTERLEAVED:
+        raise FormatError(
+            "lists its frames along the first axis, and is too large to be read at once: list "
+            "them along the last one"
+        )
     # Opening the stream compares the size with the file.
     with PixelStream(pixels.path, pixels.start, pixels.packing, pixels.frame_bytes * count):
         return pixels
@@ -164,6 +173,11 @@ def sequence_of(
             if pair is None or not field_name.endswith("Transform"):
                 continue
             if pair not in transforms:
+                if (len(transforms) + 1) * count > MOST_MATRICES:
+                    raise FormatError(
+                        f"line {line}: more than {MOST_MATRICES // count} transforms in {count} "
+                        "frames"
+                    )
                 transforms[pair] = np.full((count, 4, 4), np.nan)
                 valid[pair] = np.zeros(count, bool)
             status = fields.get(f"{field_name}Status")

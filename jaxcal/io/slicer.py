@@ -104,6 +104,8 @@ def _read_fcsv(path: str | os.PathLike[str]) -> Markups:
             raise FormatError(f"line {line}: {len(cells)} columns are no point of Slicer")
         row = dict(zip(names, cells, strict=False))
         total += 1
+        if total > MOST_POINTS:
+            raise FormatError(f"line {line}: more than {MOST_POINTS} points")
         if row.get("sel", "1") == "0":
             continue
         try:

@@ -98,6 +98,11 @@ _NOT_IMPORTED = {
     ".png": " (name the folder of the PNG images)",
     ".dcm": " (--spacing-from reads its pixel size)",
     ".vtk": "",
+    **dict.fromkeys((".avi", ".mp4", ".mov", ".mkv"), " (save its frames as PNG in a folder)"),
+    **dict.fromkeys(
+        (".bag", ".mcap", ".db3"),
+        " (save its poses as a table, CSV, and its images as PNG in a folder)",
+    ),
     ".mrb": "",
     **dict.fromkeys((".mat", ".npy", ".npz", ".xls", ".xlsx", ".ods"), _AS_TABLE),
 }

@@ -21,6 +21,8 @@ _NUMBER = re.compile(
     r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?|[-+]?(?:nan|inf(?:inity)?)", re.I
 )
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
+MOST_ROWS = 1_000_000
+"""Most rows of a table, a quarter of an hour at 1 kHz."""
 _STATED_SEPARATOR = re.compile(r'"?sep=([;,\t])"?[;,\t]*', re.I)
 _SEPARATED = {",": "commas", ";": "semicolons", "\t": "tabs", "": "white space"}
 
@@ -125,12 +127,14 @@ def read_table(
         separator: the separator, if it is known; "" for white space.
 
     Raises:
-        FormatError: cannot be read, no rows, or rows of different lengths; file and line are named.
+        FormatError: cannot be read, no or too many rows, or rows of different lengths; file and
+            line are named.
     """
     name = os.fspath(path)
     names: list[str] | None = None
     rows: list[list[str]] = []
     lines: list[int] = []
+    blank: list[str] = []
     for line, content in text_lines(path):
         # What spreadsheets are told in the first line.
         stated = _STATED_SEPARATOR.fullmatch(content.strip("\r\n"))
@@ -145,13 +149,19 @@ def read_table(
             names = _without_blank_end(cells, 0)
             continue
         width = len(names or rows[0]) if names or rows else len(cells)
-        cells = _without_blank_end(cells, width) if any(cells) else [""] * width
+        if any(cells):
+            cells = _without_blank_end(cells, width)
+        else:
+            # All empty rows are one object: however wide the table, they take no memory.
+            cells = blank = blank or [""] * width
         if len(cells) != width:
             before = "the header has" if names else "the rows before have"
             raise FormatError(
                 f"{name}:{line}: {len(cells)} columns, {before} {width} (separated by "
                 f"{_SEPARATED[separator]})"
             )
+        if len(rows) == MOST_ROWS:
+            raise FormatError(f"{name}:{line}: more than {MOST_ROWS} rows")
         rows.append(cells)
         lines.append(line)
     # A spreadsheet writes empty rows where cells below the table once held something.

@@ -29,7 +29,8 @@ from jaxcal.runtime.messages import quoted
 
 TRACKER = "Tracker"
 _BEGINNING = re.compile(r"(Tools|Format Version)\s*[,;\t]")
-MOST_ROWS = 1_000_000
+MOST_POSES = 1_000_000
+"""Of all tools in all rows."""
 _ABSENT = -1e20
 """A number below this is missing: NDI writes -3.697314E28 in its place."""
 _METRES = {"meters": 1e3, "centimeters": 10.0, "millimeters": 1.0}
@@ -104,8 +105,8 @@ def _read_rows(
     numbers: list[int] = []
     labels: list[str] = []
     for line, cells in rows:
-        if len(time) >= MOST_ROWS:
-            raise FormatError(f"line {line}: more than {MOST_ROWS} rows")
+        if (len(time) + 1) * len(tools) > MOST_POSES:
+            raise FormatError(f"line {line}: more than {MOST_POSES} poses of {len(tools)} tools")
         own: list[int] = []
         for tool, columns in tools.items():
             pose = [math.nan] * 7

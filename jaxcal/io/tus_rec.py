@@ -8,6 +8,7 @@ Source: UCL, tus-rec-challenge.
 
 from __future__ import annotations
 
+import itertools
 import os
 from pathlib import Path
 
@@ -100,7 +101,7 @@ def read_calib_matrix(
         FormatError: not the ten lines of such a file; file and line are named.
     """
     with naming(path):
-        found = list(text_lines(path))
+        found = list(itertools.islice(text_lines(path), 11))
         if len(found) != 10 or found[0][1].strip() != _SCALING:
             raise FormatError("is no calib_matrix.csv of TUS-REC: ten lines are needed")
         scaling, rigid = (_four_rows(found[start : start + 4]) for start in (1, 6))

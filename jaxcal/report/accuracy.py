@@ -118,7 +118,7 @@ def region_of(answer: Calibration, recording: Recording) -> Region:
     """The part of the image that the target filled, and the face of the probe if it is known."""
     used = np.asarray(answer.mask) > 0
     targets = targets_in_images(recording.calibration.poses, answer.image_to_probe, answer.point)
-    return seen_region(recording, targets[used])
+    return seen_region(recording, targets[used], answer.image_transform())
 
 
 def _tre(

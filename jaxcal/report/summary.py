@@ -45,6 +45,7 @@ def recording_of(calibration: Calibration) -> Recording:
         mask=mask,
         spacing_mm=spacing,
         face_offset_mm=float(np.asarray(problem.face_offset)),
+        frame_size=calibration.frame_size,
     )
     return Recording(images, probe=calibration.probe, source="memory")
 

@@ -176,6 +176,8 @@ class Calibration:
         notes: what was done to the data before the solve, in words (static; one problem).
         probe: the transducer, if a recording named it; its face is part of the region that errors
             are stated for (static; one problem).
+        frame_size: (columns, rows) of the frames, px, if a recording has it; the same region does
+            not leave them (static; one problem).
     """
 
     image_to_probe: Float[AnyArray, "*batch 4 4"]
@@ -202,6 +204,7 @@ class Calibration:
     robust: bool = static(default=False)
     notes: tuple[str, ...] = static(default=())
     probe: Probe | None = static(default=None)
+    frame_size: tuple[int, int] | None = static(default=None)
 
     @property
     def converged(self) -> Bool[AnyArray, "*batch"]:

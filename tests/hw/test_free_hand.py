@@ -106,6 +106,7 @@ def check(path: Path, order: list[int], seed: int = 1, count: int = 9) -> None:
     images = jaxcal.load(path).calibration
     used = images.mask
     assert used.sum() == len(order)
+    assert images.frame_size == (COLUMNS, ROWS)
     shift = images.poses[used][:, :3, 3] - poses[order][:, :3, 3]
     assert np.abs(shift).max() < 0.1
     turn = images.poses[used][:, :3, :3].swapaxes(1, 2) @ poses[order][:, :3, :3]

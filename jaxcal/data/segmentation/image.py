@@ -214,6 +214,7 @@ def images_from_frames(
         time=time,
         spacing_mm=spacing_mm,
         face_offset_mm=face_offset_mm,
+        frame_size=np.shape(frames)[:-3:-1],
         minimum=minimum,
     )
     return images, located
