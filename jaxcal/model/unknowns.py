@@ -297,7 +297,7 @@ def split_further(values: Any, blocks: Blocks) -> dict[str, list[Any]]:
         blocks: the free unknowns.
     """
     found = {}
-    for name in FURTHER:
+    for name in FURTHER if values is not None else ():
         if name in blocks:
             at = block_slice(blocks, name)
             found[name] = [values[..., k - RIGID_UNKNOWNS] for k in range(at.start, at.stop)]
