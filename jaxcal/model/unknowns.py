@@ -296,8 +296,10 @@ def split_further(values: Any, blocks: Blocks) -> dict[str, list[Any]]:
         values: all of them, (..., k); None if there are none.
         blocks: the free unknowns.
     """
+    if values is None:
+        return {}
     found = {}
-    for name in FURTHER if values is not None else ():
+    for name in FURTHER:
         if name in blocks:
             at = block_slice(blocks, name)
             found[name] = [values[..., k - RIGID_UNKNOWNS] for k in range(at.start, at.stop)]
