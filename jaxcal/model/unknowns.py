@@ -296,6 +296,8 @@ def split_further(values: Any, blocks: Blocks) -> dict[str, list[Any]]:
         values: all of them, (..., k); None if there are none.
         blocks: the free unknowns.
     """
+    if values is None:
+        return {}
     found = {}
     for name in FURTHER:
         if name in blocks:

@@ -259,7 +259,7 @@ def _comparison(
         return None
     used = np.asarray(answer.mask) > 0
     try:
-        other = solve_problem(replace(problem, mask=used), estimate)
+        other = solve_problem(replace(problem, mask=answer.mask), estimate)
     except InputError:
         return None
     x, spacing = np.asarray(other.image_to_probe), np.asarray(problem.spacing, float)
