@@ -15,6 +15,8 @@ How ur_rtde behaves, and what is done about it (each measured):
 from __future__ import annotations
 
 import math
+import socket
+import struct
 from typing import Any
 
 from hw.robot.mover.inputs import Ended, Inputs, lost
@@ -35,6 +37,11 @@ _REST_SEEN_S = 0.03
 _STOP_AGAIN_S = 0.05
 """stopL is sent again to a robot that still moves after this time."""
 STOP_PATIENCE_S = 2.0
+_LAST_DATA_RECEIVED = struct.Struct("=52xI")
+"""``tcpi_last_data_recv`` (ms) in Linux's ``struct tcp_info``: 8 bytes and 11 words before it."""
+_UNHEARD_S = 0.5
+"""The controller's answers are lost if none came for so long (wall s), while poses come in time:
+sending a lost packet again takes 0.2 s."""
 _CAUSE_S = 0.1
 """The poses tell of a safety stop by so much later than the controller's program ends."""
 
@@ -53,6 +60,8 @@ class Controller:
         """Which robot is connected: :attr:`hw.robot.identity.Identity.name`."""
         self.rtde_control: Any = None
         """ur_rtde's interface; None before motion may begin, and in a dry run."""
+        self.answers: socket.socket | None = None
+        """The connection over which ur_rtde hears the controller."""
         self.local = False
         """Whether a person has switched the robot to local control."""
         self.kicks = 0
@@ -66,10 +75,25 @@ class Controller:
         """One command to the controller; every one is logged before it is sent.
 
         Raises:
-            Ended: the controller's program has stopped.
+            Ended: the controller's program has stopped, or its answers are lost.
         """
+        self.check_answers()
         self.log(name, values=values)
         return self._call(name, *values)
+
+    def check_answers(self) -> None:
+        """Check that ur_rtde hears the controller: its commands wait for answers for seconds.
+
+        The system knows when something came last, whether ur_rtde has read it or not.
+
+        Raises:
+            Ended: nothing came for :data:`_UNHEARD_S`.
+        """
+        assert self.answers is not None
+        size = _LAST_DATA_RECEIVED.size
+        info = self.answers.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, size)
+        if _LAST_DATA_RECEIVED.unpack(info)[0] > 1000 * _UNHEARD_S:
+            raise Ended(lost("the controller's answers are lost"))
 
     def _call(self, name: str, *values: object) -> object:
         if self._inputs.sample.age_s(self._clock.now()) > self._max_age_s:

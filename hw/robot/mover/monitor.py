@@ -42,7 +42,7 @@ class Monitor:
             moving: the motion that runs; None at rest.
 
         Raises:
-            Ended: the connection is lost.
+            Ended: the connection, or the answers that come over it, are lost.
         """
         inputs = self._inputs
         packets = inputs.unseen()
@@ -65,6 +65,7 @@ class Monitor:
             return _hesitation(
                 f"no fresh pose: the newest is {sample.age_text(now)}; the motion was stopped"
             )
+        self._controller.check_answers()
         force = max(packet.force_n for packet in packets)
         if force > limits.max_force_n:
             return _for_good(f"a force of {force:.1f} N, over the cap of {limits.max_force_n:g} N")
