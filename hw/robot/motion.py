@@ -148,7 +148,12 @@ class Motion:
                 answer = {}
         except BaseException:
             if self._process is not None:
-                self._kill(refused("motion was interrupted at its start"))
+                try:
+                    # Killed while it connects, it would leave a program without a watchdog on the
+                    # robot. A second interrupt ends the wait.
+                    self.close()
+                finally:
+                    self._kill(refused("motion was interrupted at its start"))
             raise
         if answer.get("what") != "ready":
             error = error_of(answer) or LostError(

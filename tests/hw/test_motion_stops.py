@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, suppress
@@ -79,6 +80,27 @@ def test_a_guard_that_fails_stops_the_robot():
         motion.guard = None
         with pytest.raises(RefusedError, match="confirm the plan again"):
             motion.move_to(HOME)
+
+
+def test_an_interrupt_while_connecting_leaves_no_program_on_the_robot():
+    """Our program has no watchdog yet: left there, only a person at the pendant could end it."""
+    with EmulatedRobot(version=CB_SERIES) as robot:
+        plan = replace(PLAN, serial=read_identity(robot.host).name)
+        given = confirm_unattended(plan, plan.digest, clock=robot.clock)
+        motion = Motion(robot.host, plan, given, clock=robot.clock, dry_run=False)
+
+        def interrupt() -> None:
+            while not robot.state()["running"]:
+                time.sleep(0.001)
+            os.kill(os.getpid(), signal.SIGINT)
+
+        watcher = threading.Thread(target=interrupt)
+        watcher.start()
+        with pytest.raises(KeyboardInterrupt):
+            motion.start()
+        watcher.join()
+        assert not robot.state()["running"]
+        assert motion.ended
 
 
 _CALLER = """
