@@ -56,8 +56,8 @@ class Monitor:
             return _for_good(f"{LOCAL}; then confirm the plan again")
         if inputs.program_ended or not inputs.packet.status_bits & PROGRAM_RUNS:
             return Stop(self._controller.program_stopped(), True)
-        if not self._controller.rtde_control.isConnected():
-            return Stop(lost("the control connection is gone"), True)
+        if not self._controller.connected:
+            return Stop(lost("the control connection was reset"), True)
         if moving is None:
             return None
         sample, limits, now = inputs.sample, self._limits, self._clock.now()
