@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from hw.active_echo.device import ActiveEcho, EchoFrame
+from hw.active_echo.device import SILENT, ActiveEcho, EchoFrame
 from hw.freehand.guide import mean_pose, spread_of
 from hw.freehand.posed import PosedImage, PosedImages, pose_at_arrival
 from hw.freehand.request import FreeHand, Person, recorded_request
@@ -226,10 +226,7 @@ class _Run(Run):
         if frames:
             self._heard = now
         elif now - self._heard > _SILENCE_S:
-            raise StaleError(
-                f"no frame for {_SILENCE_S:g} s: is the frame trigger unplugged?",
-                device="active echo",
-            )
+            raise StaleError(f"no frame for {_SILENCE_S:g} s: {SILENT}", device="active echo")
         self._recorder.add_echo(frames)
         if frames:
             self._late_s = frames[-1].late_s
