@@ -147,13 +147,9 @@ class Motion:
             except queue.Empty:
                 answer = {}
         except BaseException:
-            if self._process is not None:
-                try:
-                    # Killed while it connects, it would leave a program without a watchdog on the
-                    # robot. A second interrupt ends the wait.
-                    self.close()
-                finally:
-                    self._kill(refused("motion was interrupted at its start"))
+            # Killed while it connects, it would leave a program without a watchdog on the robot.
+            # After a second interrupt it ends by itself.
+            self.close()
             raise
         if answer.get("what") != "ready":
             error = error_of(answer) or LostError(

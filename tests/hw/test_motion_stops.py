@@ -82,7 +82,8 @@ def test_a_guard_that_fails_stops_the_robot():
             motion.move_to(HOME)
 
 
-def test_an_interrupt_while_connecting_leaves_no_program_on_the_robot():
+@pytest.mark.parametrize("times", [1, 2])
+def test_interrupts_while_connecting_leave_no_program_on_the_robot(times):
     """Our program has no watchdog yet: left there, only a person at the pendant could end it."""
     with EmulatedRobot(version=CB_SERIES) as robot:
         plan = replace(PLAN, serial=read_identity(robot.host).name)
@@ -92,15 +93,21 @@ def test_an_interrupt_while_connecting_leaves_no_program_on_the_robot():
         def interrupt() -> None:
             while not robot.state()["running"]:
                 time.sleep(0.001)
-            os.kill(os.getpid(), signal.SIGINT)
+            for _ in range(times):
+                os.kill(os.getpid(), signal.SIGINT)
+                time.sleep(0.05)
 
         watcher = threading.Thread(target=interrupt)
         watcher.start()
-        with pytest.raises(KeyboardInterrupt):
-            motion.start()
-        watcher.join()
+        with as_interrupts(), pytest.raises(KeyboardInterrupt):
+            try:
+                motion.start()
+            finally:
+                watcher.join()
+        assert motion._process is not None
+        motion._process.wait(5.0)
         assert not robot.state()["running"]
-        assert motion.ended
+        motion.close()
 
 
 _CALLER = """

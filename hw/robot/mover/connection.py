@@ -22,6 +22,8 @@ from hw.runtime.errors import LostError, refused
 from hw.runtime.extras import require
 from hw.runtime.processes import ASKS, RECEIVES, be_prompt
 
+_START_S = 30.0
+"""Longest time for ur_rtde to connect."""
 _END_S = 5.0
 """Longest time for the end of the script and of the connection."""
 _DASHBOARD_S = 0.3
@@ -67,6 +69,8 @@ class Connection:
         self._no_reconnect = NoReconnect(setup.host)
         controller.log("connect", host=setup.host, serial=identity.name)
         try:
+            # A silent controller would hold this for ever, and the caller may be gone.
+            _end_within(_START_S)
             # The thread that ur_rtde starts inherits this priority.
             be_prompt(RECEIVES)
             controller.rtde_control = module.RTDEControlInterface(setup.host)
@@ -74,6 +78,7 @@ class Connection:
             raise LostError(said(error), device="robot") from None
         finally:
             be_prompt(ASKS)
+        _end_within(0.0)
         controller.answers = _connection_among(set(os.listdir("/proc/self/fd")) - before)
         self._no_reconnect.begin()
         controller.watch_rest()
@@ -190,6 +195,6 @@ def _connection_among(descriptors: set[str]) -> socket.socket:
 
 
 def _end_within(seconds: float) -> None:
-    """Let the system end this process after so long, whatever it hangs in."""
+    """Let the system end this process after so long, whatever it hangs in; 0: not any more."""
     if hasattr(signal, "setitimer"):
         signal.setitimer(signal.ITIMER_REAL, seconds)
