@@ -97,13 +97,16 @@ def test_interrupts_while_connecting_leave_no_program_on_the_robot(times):
                 os.kill(os.getpid(), signal.SIGINT)
                 time.sleep(0.05)
 
-        watcher = threading.Thread(target=interrupt)
-        watcher.start()
-        with as_interrupts(), pytest.raises(KeyboardInterrupt):
+        def start() -> None:
+            watcher = threading.Thread(target=interrupt)
+            watcher.start()
             try:
                 motion.start()
             finally:
                 watcher.join()
+
+        with as_interrupts(), pytest.raises(KeyboardInterrupt):
+            start()
         assert motion._process is not None
         motion._process.wait(5.0)
         assert not robot.state()["running"]
@@ -207,6 +210,19 @@ def test_a_caller_that_was_suspended_for_long_does_not_go_on_by_itself(monkeypat
         assert robot.state()["velocity"] == [0.0] * 6
         with pytest.raises(RefusedError, match=r"suspended for .*confirm the plan"):
             motion.move_to(PLAN.targets[2])
+
+
+def test_a_caller_that_was_suspended_while_it_connects_does_not_move(monkeypatch):
+    monkeypatch.setattr("hw.robot.motion._SUSPENDED_WALL_S", 0.2)
+    script = f"sleep 0.2; kill -STOP {os.getpid()}; sleep 1; kill -CONT {os.getpid()}"
+    with (
+        EmulatedRobot() as robot,
+        subprocess.Popen(["sh", "-c", script]),
+        moving(robot) as motion,
+        pytest.raises(RefusedError, match="program was suspended for"),
+    ):
+        motion.move_to(PLAN.targets[2])
+    assert motion.ended
 
 
 def test_a_stop_while_it_connects_is_heard():
