@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from hw.active_echo.device import SILENT, ActiveEcho, EchoFrame
-from hw.freehand.guide import mean_pose, spread_of
+from hw.freehand.guide import spread_of
 from hw.freehand.posed import PosedImage, PosedImages, pose_at_arrival
 from hw.freehand.request import FreeHand, Person, recorded_request
 from hw.freehand.run import KeptImages, Run, read_images
@@ -44,6 +44,7 @@ from hw.recording.resuming import (
 )
 from hw.recording.session import DELAY_S, Watch, median_times
 from hw.runtime.errors import DeviceError, StaleError
+from hw.runtime.rigid import mean_pose
 from hw.setup.description import HandHeldSetup
 from hw.ultrasound.receiver import UltrasoundStream
 from jaxcal.data.poses import inverse_poses
