@@ -179,8 +179,11 @@ def acquire(
                         _write_truth(recorder, emulated)
                     _finish(recorder, job.images - estimator.count)
     except KeyboardInterrupt:
-        # Ctrl-C once more, while everything was being closed: the pipe's end stops the robot.
+        # Ctrl-C once more, while everything was being closed: the pipe's end stops the robot. What
+        # waits for the disk is still written; a further Ctrl-C leaves at once.
         interrupted, by_itself = True, False
+        with suppress(CalibrationError):
+            recorder.close()
     if failure is not None:
         raise failure
     if recorder.error is not None and not interrupted:

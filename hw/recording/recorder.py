@@ -314,12 +314,12 @@ class Recorder:
     def close(self) -> None:
         """Write what waits and close the file; it stays incomplete unless it was finished.
 
+        Idempotent, also after an interrupt of an earlier call.
+
         Raises:
             OutputError: the writer failed.
         """
-        if self._ended:
-            return
-        if self.error is None:
+        if self.error is None and not self._ended:
             self._note_drops()
         self._stop()
         if self.error is not None:

@@ -8,6 +8,7 @@ import resource
 import signal
 import subprocess
 import sys
+import threading
 import time
 from types import SimpleNamespace
 
@@ -114,6 +115,21 @@ def test_signals_that_end_all_processes_leave_the_writer_to_the_acquisition(tmp_
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
             os.kill(recorder._process.pid, number)
         recorder.add_event("stopped", "interrupted", 1.0)
+    with h5py.File(path) as file:
+        assert file["events/text"][0] == b"interrupted"
+
+
+def test_what_waits_is_written_though_closing_was_interrupted(tmp_path):
+    """Ctrl-C twice: the first has put the run's end into the queue, the second comes meanwhile."""
+    path = tmp_path / "rec.h5"
+    recorder = Recorder(path, HEADER)
+    os.kill(recorder._process.pid, signal.SIGSTOP)
+    recorder.add_event("stopped", "interrupted", 1.0)
+    threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
+    with pytest.raises(KeyboardInterrupt):
+        recorder.close()
+    os.kill(recorder._process.pid, signal.SIGCONT)
+    recorder.close()
     with h5py.File(path) as file:
         assert file["events/text"][0] == b"interrupted"
 
