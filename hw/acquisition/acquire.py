@@ -153,6 +153,7 @@ def acquire(
     estimator.warm_up(job.targets[: job.images])
     recorder = open_recorder(path, job)
     reason, interrupted, by_itself = "interrupted", False, False
+    failure: Exception | None = None
     try:
         with _closing(recorder):
             try:
@@ -166,6 +167,9 @@ def acquire(
                 reason = str(error)
                 # A stream that hesitated or a watchdog that tripped: a person would only try again.
                 by_itself = isinstance(error, StaleError | LostError)
+            except Exception as error:
+                # Standard error is gone, or a fault of this program: for the caller to report.
+                reason, failure = f"{type(error).__name__}: {error}", error
             # Motion has ended by now: no process of ours moves the robot any more.
             with suppress(CalibrationError):
                 recorder.add_event("stopped", reason, setup.clock.now())
@@ -175,8 +179,13 @@ def acquire(
                         _write_truth(recorder, emulated)
                     _finish(recorder, job.images - estimator.count)
     except KeyboardInterrupt:
-        # Ctrl-C once more, while everything was being closed: the pipe's end stops the robot.
+        # Ctrl-C once more, while everything was being closed: the pipe's end stops the robot. What
+        # waits for the disk is still written; a further Ctrl-C leaves at once.
         interrupted, by_itself = True, False
+        with suppress(CalibrationError):
+            recorder.close()
+    if failure is not None:
+        raise failure
     if recorder.error is not None and not interrupted:
         # The recorder's failure is the cause of what went wrong.
         reason = str(recorder.error)

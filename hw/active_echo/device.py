@@ -41,6 +41,9 @@ from jaxcal.runtime.array_types import Float
 COMMAND_TIMEOUT_S = 1.0
 """A command that is not answered within this bench time has failed."""
 
+SILENT = "is the ultrasound machine frozen, its frame trigger unplugged, or the electronics off?"
+"""Why no frames may come."""
+
 # Where a bench runs faster than real time, the operating system does not become faster.
 _SHORTEST_WAIT_S = 0.25
 
@@ -262,11 +265,7 @@ class ActiveEcho:
                 return self._frames.popleft()
             if self._failure is not None:
                 raise self._failure
-        raise StaleError(
-            f"no frame from {self.url} for {timeout_s:g} s: is the ultrasound machine frozen, or "
-            "is its frame trigger unplugged?",
-            device=DEVICE,
-        )
+        raise StaleError(f"no frame from {self.url} for {timeout_s:g} s: {SILENT}", device=DEVICE)
 
     def drain(self) -> list[EchoFrame]:
         """All frames that wait, oldest first; may be none.

@@ -109,7 +109,9 @@ def open_transport(url: str, *, baud: int = BAUD) -> Transport:
     except (OSError, ValueError) as error:
         text = _first_line(error)
         if getattr(error, "errno", None) == errno.ENOENT:
-            text = "there is no such port"
+            found = require("serial.tools.list_ports", extra="serial").comports()
+            ports = ", ".join(sorted(port.device for port in found)) or "no serial ports"
+            text = f"there is no such port, perhaps it has another number now: there are {ports}"
         elif "lock" in text:
             text = "another program uses it"
         raise DeviceError(f"cannot open {url}: {text}", device=DEVICE) from None

@@ -115,7 +115,7 @@ class RtdeServer:
             queue.SimpleQueue()
         )
         self._wake, self._woken = socket.socketpair()
-        self._muted = False
+        self._muted = self._answers_lost = False
         self._running = False
         self._thread: threading.Thread | None = None
 
@@ -167,6 +167,7 @@ class RtdeServer:
 
         - ``mute``: neither read nor write; connections stay, and new ones are accepted but not
           answered; ``unmute``;
+        - ``mute control`` (on): no packets any more to those that command; they are read as before;
         - ``drop``: reset all clients' connections; ``drop control``: only those that command;
         - ``protective_stop``: as if the arm had met an obstacle; ``unlock``;
         - ``robot_state`` (robot_mode, safety_mode): :meth:`hw.bench.controller.Controller.enter`;
@@ -192,6 +193,8 @@ class RtdeServer:
         match wanted:
             case ["mute" | "unmute" as name]:
                 self._mute(name == "mute")
+            case ["mute control", on]:
+                self._answers_lost = bool(on)
             case ["drop"]:
                 self._drop(self._connections)
             case ["drop control"]:
@@ -371,7 +374,9 @@ class RtdeServer:
 
     def _publish(self, t: float) -> None:
         self.packets += 1
-        listeners = [c for c in self._connections if c.started]
+        listeners = [
+            c for c in self._connections if c.started and not (self._answers_lost and c.inputs)
+        ]
         if not listeners:
             return
         values = self._values(t)

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hw.freehand.posed import PosedImage
+from hw.runtime.rigid import mean_pose
 from jaxcal import InputError
 from jaxcal.data.segmentation.image import localise
 from jaxcal.data.segmentation.spot import Target
@@ -244,11 +245,3 @@ def spread_of(poses: Float[np.ndarray, "n 4 4"]) -> tuple[float, float]:
     shift = np.linalg.norm(poses[:, :3, 3] - poses[-1, :3, 3], axis=1).max()
     turns = Rotation.from_matrix(poses[-1, :3, :3].T @ poses[:, :3, :3]).magnitude()
     return float(shift), float(np.degrees(turns.max()))
-
-
-def mean_pose(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "4 4"]:
-    """Mean of poses that are nearly the same."""
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_matrix(poses[:, :3, :3]).mean().as_matrix()
-    pose[:3, 3] = poses[:, :3, 3].mean(axis=0)
-    return pose

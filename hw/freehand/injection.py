@@ -23,8 +23,8 @@ from typing import Any
 
 import numpy as np
 
-from hw.active_echo.device import ActiveEcho, EchoFrame
-from hw.freehand.guide import mean_pose, spread_of
+from hw.active_echo.device import SILENT, ActiveEcho, EchoFrame
+from hw.freehand.guide import spread_of
 from hw.freehand.posed import PosedImage, PosedImages, pose_at_arrival
 from hw.freehand.request import FreeHand, Person, recorded_request
 from hw.freehand.run import KeptImages, Run, read_images
@@ -44,6 +44,7 @@ from hw.recording.resuming import (
 )
 from hw.recording.session import DELAY_S, Watch, median_times
 from hw.runtime.errors import DeviceError, StaleError
+from hw.runtime.rigid import mean_pose
 from hw.setup.description import HandHeldSetup
 from hw.ultrasound.receiver import UltrasoundStream
 from jaxcal.data.poses import inverse_poses
@@ -226,10 +227,7 @@ class _Run(Run):
         if frames:
             self._heard = now
         elif now - self._heard > _SILENCE_S:
-            raise StaleError(
-                f"no frame for {_SILENCE_S:g} s: is the frame trigger unplugged?",
-                device="active echo",
-            )
+            raise StaleError(f"no frame for {_SILENCE_S:g} s: {SILENT}", device="active echo")
         self._recorder.add_echo(frames)
         if frames:
             self._late_s = frames[-1].late_s

@@ -82,7 +82,7 @@ class Recorder:
         """The first error of the writer; None as long as it writes."""
         self.kept = self.path
         """Where the rows are: maybe another path, if the file was moved, removed or replaced."""
-        self._ending = self._ended = False
+        self._ending = self._ended = self._closed = False
         self._marks = 0
         # In a session of its own: Ctrl-C, or a signal to the whole group, must not stop the writer.
         self._process = spawn("hw.recording.writer_process", self.path, stdin=True, stderr=None)
@@ -314,12 +314,14 @@ class Recorder:
     def close(self) -> None:
         """Write what waits and close the file; it stays incomplete unless it was finished.
 
+        Idempotent, also after an interrupt of an earlier call.
+
         Raises:
             OutputError: the writer failed.
         """
-        if self._ended:
+        if self._closed:
             return
-        if self.error is None:
+        if self.error is None and not self._ended:
             self._note_drops()
         self._stop()
         if self.error is not None:
@@ -397,6 +399,7 @@ class Recorder:
         self._listener.join(_ENDING_S)
         if self._process.stdout is not None:
             self._process.stdout.close()
+        self._closed = True
 
     def _feed(self, pipe: BinaryIO) -> None:
         try:

@@ -19,7 +19,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from hw.active_echo.device import ActiveEcho, EchoFrame, median_of
+from hw.active_echo.device import SILENT, ActiveEcho, EchoFrame, median_of
 from hw.recording.recorder import Recorder
 from hw.robot.stream import PoseSample, PoseStream
 from hw.runtime.errors import DeviceError, StaleError
@@ -167,7 +167,7 @@ class Session:
             return error
         if isinstance(error, DeviceError) and error.device == "robot":
             return str(error.args[0])  # the error that stops the robot names it
-        return str(error)
+        return f"stopped: {error}"
 
     def check(self) -> None:
         """Raise the error if something is wrong.
@@ -221,8 +221,7 @@ class Session:
                     )
             if now - self._echo_seen > self.clock.patience(watch.echo_age_s):
                 return StaleError(
-                    f"no frame for {now - self._echo_seen:.2f} s: is the ultrasound machine "
-                    "frozen, or is its frame trigger unplugged?",
+                    f"no frame for {now - self._echo_seen:.2f} s: {SILENT}",
                     device="active echo",
                 )
             late = self._echo_frames[-1].late_s if self._echo_frames else 0.0

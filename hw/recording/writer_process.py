@@ -20,6 +20,7 @@ from contextlib import suppress
 from typing import Any
 
 from hw.recording.file import RecordingWriter
+from hw.runtime.interrupts import ENDING
 from jaxcal import CalibrationError
 from jaxcal.io.given_files import one_line
 
@@ -30,8 +31,9 @@ _MOST_WAITING = 4
 
 def main(path: str) -> int:
     """Write until standard input ends; 0 if all went well."""
-    for name in (signal.SIGINT, signal.SIGHUP):
-        signal.signal(name, signal.SIG_IGN)
+    # A system that is shut down sends them to all processes; the acquisition ends this one.
+    for number in ENDING:
+        signal.signal(number, signal.SIG_IGN)
     # h5py or a library may print; only answers may go to the pipe that the acquisition reads.
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)

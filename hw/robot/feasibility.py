@@ -147,16 +147,14 @@ def follow(
     branch = int(branch_of(arm.model, joints))
     turn = rotation_vector(goal[:3, :3] @ start[:3, :3].T)
     travel = goal[:3, 3] - start[:3, 3]
-    lever = tool_of(arm.tcp_offset)[:3, 3]
     angle = float(np.linalg.norm(turn))
+    lever_mm = float(np.linalg.norm(tool_of(arm.tcp_offset)[:3, 3]))
     # A bound of the flange's path: the TCP's line plus the arc about the TCP.
-    length = math.hypot(
-        float(np.linalg.norm(travel)) + angle * float(np.linalg.norm(lever)), angle * ANGLE_MM
-    )
+    length = math.hypot(float(np.linalg.norm(travel)) + angle * lever_mm, angle * ANGLE_MM)
     moving = length > 1e-9
     count = 1 + math.ceil(length / _COARSE_MM) if moving else 1
     while True:
-        parts = np.linspace(0.0, 1.0, count) if count > 1 else np.zeros(1)
+        parts = np.linspace(0.0, 1.0, count)
         way = straight_way(start, goal, parts)
         path = _joints_along(arm, way, branch, joints, what, parts)
         matrix = scaled_jacobian(arm.model, path)
@@ -165,16 +163,12 @@ def follow(
         rates = np.zeros_like(path)
         if not moving:
             break
-        offsets = way[:, :3, :3] @ -(tool_of(arm.tcp_offset)[:3, :3].T @ lever)
-        velocity = travel + np.cross(turn, offsets)
-        twist = np.concatenate([velocity, np.tile(turn * ANGLE_MM, (count, 1))], axis=1)
+        twist = _twists(arm, way, travel, turn)
         rates = np.linalg.solve(matrix, twist[..., None])[..., 0]
-        half = 0.5 / max(count - 1, 1)
+        half = 0.5 / (count - 1)
         # The twist changes as the lever turns: between the samples by at most this much.
-        bend = angle**2 * float(np.linalg.norm(lever)) * half
-        speed = np.linalg.norm(rates, axis=1) + bend / dexterity
-        proven = 1 - (_PROVEN * arm.least_dexterity_mm / dexterity) ** 2
-        enough = proven * dexterity / (2 * arm.model.jacobian_lipschitz_mm * speed)
+        bend = angle**2 * lever_mm * half
+        enough = _half_distance(arm, dexterity, np.linalg.norm(rates, axis=1) + bend / dexterity)
         if half <= enough.min():
             break
         # The bend shrinks with the distance, and new samples may be nearer to a singularity.
@@ -188,6 +182,27 @@ def follow(
     fastest = _check_speed(arm, rates, duration_s, what, parts)
     _check_links(arm, path, what, parts)
     return Course(branch, path[[0, -1]], float(dexterity.min()), fastest)
+
+
+def _twists(
+    arm: Arm,
+    way: Float[np.ndarray, "n 4 4"],
+    travel: Float[np.ndarray, " 3"],
+    turn: Float[np.ndarray, " 3"],
+) -> Float[np.ndarray, "n 6"]:
+    """V of the module's head: the flange's velocity, mm, and ANGLE_MM times its turn, per way."""
+    tool = tool_of(arm.tcp_offset)
+    to_flange = way[:, :3, :3] @ -(tool[:3, :3].T @ tool[:3, 3])
+    velocity = travel + np.cross(turn, to_flange)
+    return np.concatenate([velocity, np.tile(turn * ANGLE_MM, (len(way), 1))], axis=1)
+
+
+def _half_distance(
+    arm: Arm, dexterity: Float[np.ndarray, " n"], speed: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, " n"]:
+    """The largest h of the module's head for which sigma is shown to be large enough."""
+    proven = 1 - (_PROVEN * arm.least_dexterity_mm / dexterity) ** 2
+    return proven * dexterity / (2 * arm.model.jacobian_lipschitz_mm * speed)
 
 
 def follow_all(

@@ -51,7 +51,7 @@ Guard = Callable[[], str | StaleError | None]
 robot and ends motion; a returned StaleError stops the robot as a hesitation."""
 
 _TICK_S = 0.02
-_START_PATIENCE_S = 30.0
+_START_PATIENCE_S, _START_TICK_S = 30.0, 0.1
 # The controller's watchdog has stopped the robot long before; a busy machine gets time to answer.
 _HANGS_WALL_S = 2.0
 _HELD_UP_WALL_S = 0.5
@@ -142,13 +142,18 @@ class Motion:
                 self._write(setup)
             self._thread = threading.Thread(target=self._receive, name="motion", daemon=True)
             self._thread.start()
-            try:
-                answer = self._answers.get(timeout=_START_PATIENCE_S)
-            except queue.Empty:
-                answer = {}
+            deadline = time.monotonic() + _START_PATIENCE_S
+            answer: dict = {}
+            while not answer and time.monotonic() < deadline:
+                # It may be silent while it connects; this process waits in short steps.
+                self._told = time.monotonic()
+                with contextlib.suppress(queue.Empty):
+                    answer = self._answers.get(timeout=_START_TICK_S)
+                self._check_suspended()
         except BaseException:
-            if self._process is not None:
-                self._kill(refused("motion was interrupted at its start"))
+            # Killed while it connects, it would leave a program without a watchdog on the robot.
+            # After a second interrupt it ends by itself.
+            self.close()
             raise
         if answer.get("what") != "ready":
             error = error_of(answer) or LostError(
@@ -161,7 +166,6 @@ class Motion:
         self.serial = str(answer["serial"])
         offset = answer["tcp_offset"]
         self.tcp_offset = None if offset is None else tuple(offset)
-        self._told = time.monotonic()
         return self
 
     def __enter__(self) -> Motion:
@@ -381,9 +385,7 @@ class Motion:
             with self._process.stdout as lines:
                 for line in lines:
                     self._check_suspended()
-                    self._heard = time.monotonic()
-                    if self.serial is not None:
-                        self._told = self._heard
+                    self._heard = self._told = time.monotonic()
                     self._hear(json.loads(line))
         finally:
             text = "the motion process ended; the robot's own watchdog stops it"

@@ -26,7 +26,7 @@ from hw.robot.rtde import Packet, PendantSettings, too_late
 from hw.runtime.clock import REAL, Clock, Lag
 from hw.runtime.errors import DeviceError, LostError, StaleError, refused
 from hw.runtime.processes import spawn
-from hw.runtime.rigid import rotation_vector, ur_to_pose
+from hw.runtime.rigid import mean_pose, pose_to_ur, ur_to_pose
 from jaxcal.runtime.array_types import Float
 
 _OFFSET_TOLERANCE = 1e-6
@@ -305,18 +305,13 @@ def offset_changed(first: Sequence[float], second: Sequence[float]) -> bool:
 
 
 def average(samples: Sequence[PoseSample]) -> SteadyPose:
-    """Mean position and orientation of poses that are near each other.
-
-    The orientation's mean is the rotation nearest to the mean matrix.
-    """
+    """The mean (:func:`hw.runtime.rigid.mean_pose`) of poses that are near each other."""
     poses = ur_to_pose(np.array([sample.raw for sample in samples]))
-    position = poses[:, :3, 3].mean(axis=0)
-    u, _, vt = np.linalg.svd(poses[:, :3, :3].mean(axis=0))
-    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    raw = tuple(float(v) for v in (*(position / 1000.0), *rotation_vector(rotation)))
-    mean = replace(samples[-1], raw=raw, joints=None)
-    distances = np.sum((poses[:, :3, 3] - position) ** 2, axis=1)
-    return SteadyPose(mean, len(samples), float(np.sqrt(distances.mean())))
+    mean = mean_pose(poses)
+    raw = tuple(float(v) for v in pose_to_ur(mean))
+    distances = np.sum((poses[:, :3, 3] - mean[:3, 3]) ** 2, axis=1)
+    sample = replace(samples[-1], raw=raw, joints=None)
+    return SteadyPose(sample, len(samples), float(np.sqrt(distances.mean())))
 
 
 def _numbers(values: Sequence[float]) -> str:

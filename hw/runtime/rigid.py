@@ -82,6 +82,15 @@ def rigid(
     return matrix
 
 
+def mean_pose(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "4 4"]:
+    """Mean position (mm) of poses near each other, and the rotation nearest to the mean matrix."""
+    u, _, vt = np.linalg.svd(poses[:, :3, :3].mean(axis=0))
+    pose = np.eye(4)
+    pose[:3, :3] = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    pose[:3, 3] = poses[:, :3, 3].mean(axis=0)
+    return pose
+
+
 def straight_way(
     start: Float[np.ndarray, "4 4"], goal: Float[np.ndarray, "4 4"], parts: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n 4 4"]:

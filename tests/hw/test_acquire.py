@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import resource
@@ -503,6 +504,22 @@ def test_a_fault_of_any_device_stops_the_robot_and_the_run_is_resumed(e_series, 
                 assert not file.attrs["complete"]
                 assert file["events/kind"][-1] == b"stopped"
             assert main(["calibrate", str(path)]) == 2
+
+
+def test_what_ends_a_run_is_recorded_whatever_it_is(e_series, tmp_path):
+    """As where the pipe that standard error leads to is closed: nobody else can tell later."""
+    path = tmp_path / "rec.h5"
+
+    def say(line: str) -> None:
+        if line.startswith("confirmed: "):
+            raise BrokenPipeError(errno.EPIPE, "Broken pipe")
+
+    request = AcquisitionRequest(4, "none", 1, bench=3)
+    with pytest.raises(BrokenPipeError):
+        run(e_series, path, request, say, setup=quick_setup_of(e_series))
+    with h5py.File(path) as file:
+        assert file["events/kind"][-1] == b"stopped"
+        assert file["events/text"][-1] == b"BrokenPipeError: [Errno 32] Broken pipe"
 
 
 @pytest.mark.slow

@@ -92,6 +92,7 @@ def fault_in_motion(
 def put_in_order(robot: EmulatedRobot) -> None:
     """End every fault, and set at the pendant what the plan says."""
     robot.ask("unmute")
+    robot.ask("mute control", False)
     robot.ask("dashboard", None)
     robot.ask("robot_state", 7, 1)
     robot.ask("payload", 0.0)
@@ -194,6 +195,19 @@ def test_a_robot_that_is_faster_than_commanded_is_stopped(robots):
         assert motion.ended
     robot.ask("overspeed", 1.0)
     assert abs(1000.0 * robot.state()["raw"][0] - target[0, 3]) > 1.0
+
+
+def test_lost_answers_end_motion_though_poses_come(robots):
+    """ur_rtde would tell 2.5 s later, and a command would wait until then."""
+    robot = robots["CB"]
+    put_in_order(robot)
+    with moving(robot, caller_s=2.0) as motion:
+        fault = partial(robot.ask, "mute control", True)
+        error, rest_s, told_s = fault_in_motion(robot, motion, fault)
+        with pytest.raises(LostError, match="the controller's answers are lost"):
+            raise error
+        assert rest_s <= 0.5 + STOP_WITHIN_S
+        assert told_s < 1.5
 
 
 @pytest.mark.parametrize("dashboard", [None, ""], ids=["answers", "mute"])

@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, suppress
@@ -79,6 +80,37 @@ def test_a_guard_that_fails_stops_the_robot():
         motion.guard = None
         with pytest.raises(RefusedError, match="confirm the plan again"):
             motion.move_to(HOME)
+
+
+@pytest.mark.parametrize("times", [1, 2])
+def test_interrupts_while_connecting_leave_no_program_on_the_robot(times):
+    """Our program has no watchdog yet: left there, only a person at the pendant could end it."""
+    with EmulatedRobot(version=CB_SERIES) as robot:
+        plan = replace(PLAN, serial=read_identity(robot.host).name)
+        given = confirm_unattended(plan, plan.digest, clock=robot.clock)
+        motion = Motion(robot.host, plan, given, clock=robot.clock, dry_run=False)
+
+        def interrupt() -> None:
+            while not robot.state()["running"]:
+                time.sleep(0.001)
+            for _ in range(times):
+                os.kill(os.getpid(), signal.SIGINT)
+                time.sleep(0.05)
+
+        def start() -> None:
+            watcher = threading.Thread(target=interrupt)
+            watcher.start()
+            try:
+                motion.start()
+            finally:
+                watcher.join()
+
+        with as_interrupts(), pytest.raises(KeyboardInterrupt):
+            start()
+        assert motion._process is not None
+        motion._process.wait(5.0)
+        assert not robot.state()["running"]
+        motion.close()
 
 
 _CALLER = """
@@ -178,6 +210,19 @@ def test_a_caller_that_was_suspended_for_long_does_not_go_on_by_itself(monkeypat
         assert robot.state()["velocity"] == [0.0] * 6
         with pytest.raises(RefusedError, match=r"suspended for .*confirm the plan"):
             motion.move_to(PLAN.targets[2])
+
+
+def test_a_caller_that_was_suspended_while_it_connects_does_not_move(monkeypatch):
+    monkeypatch.setattr("hw.robot.motion._SUSPENDED_WALL_S", 0.2)
+    script = f"sleep 0.2; kill -STOP {os.getpid()}; sleep 1; kill -CONT {os.getpid()}"
+    with (
+        EmulatedRobot() as robot,
+        subprocess.Popen(["sh", "-c", script]),
+        moving(robot) as motion,
+        pytest.raises(RefusedError, match="program was suspended for"),
+    ):
+        motion.move_to(PLAN.targets[2])
+    assert motion.ended
 
 
 def test_a_stop_while_it_connects_is_heard():

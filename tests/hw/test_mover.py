@@ -99,7 +99,7 @@ def test_a_stop_that_is_read_with_the_setup_is_latched(pipe):
     later = line_of(stop_of(StoppedError, 0)) + line_of({"request": "heard"})
     os.write(write, line_of({"setup": True}) + later[:-5])
     assert caller.first() == {"setup": True}
-    inputs = Inputs(caller, 0, CLOCK)
+    inputs = Inputs(caller, CLOCK)
     assert inputs.latch.stop is not None
     assert inputs.latch.stop.for_good
     os.write(write, later[-5:])
@@ -126,7 +126,7 @@ def test_only_a_hesitation_about_an_answered_move_is_ignored(pipe, kind, move, l
     caller, write = pipe
     os.write(write, line_of({"setup": True}) + line_of(stop_of(kind, move)))
     caller.first()
-    stop = Inputs(caller, 0, CLOCK).latch.stop
+    stop = Inputs(caller, CLOCK).latch.stop
     assert (stop is not None) == latched
     assert stop is None or type(stop.error) is kind
 

@@ -8,6 +8,7 @@ import resource
 import signal
 import subprocess
 import sys
+import threading
 import time
 from types import SimpleNamespace
 
@@ -105,6 +106,32 @@ def test_an_event_may_name_a_path_that_is_not_utf_8(tmp_path):
     recorder.finish()
     with h5py.File(os.fsencode(path)) as file:
         assert file["events/text"][0] == rb"r\udcff.h5: the disk is nearly full"
+
+
+def test_signals_that_end_all_processes_leave_the_writer_to_the_acquisition(tmp_path):
+    """At a system's shutdown: why the run has ended must still be written."""
+    path = tmp_path / "rec.h5"
+    with Recorder(path, HEADER) as recorder:
+        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+            os.kill(recorder._process.pid, number)
+        recorder.add_event("stopped", "interrupted", 1.0)
+    with h5py.File(path) as file:
+        assert file["events/text"][0] == b"interrupted"
+
+
+def test_what_waits_is_written_though_closing_was_interrupted(tmp_path):
+    """Ctrl-C twice: the first has put the run's end into the queue, the second comes meanwhile."""
+    path = tmp_path / "rec.h5"
+    recorder = Recorder(path, HEADER)
+    os.kill(recorder._process.pid, signal.SIGSTOP)
+    recorder.add_event("stopped", "interrupted", 1.0)
+    threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
+    with pytest.raises(KeyboardInterrupt):
+        recorder.close()
+    os.kill(recorder._process.pid, signal.SIGCONT)
+    recorder.close()
+    with h5py.File(path) as file:
+        assert file["events/text"][0] == b"interrupted"
 
 
 def test_a_finished_recording_is_what_calibrate_takes(tmp_path, capsys):

@@ -18,14 +18,15 @@ from hw.runtime.processes import ASKS, be_prompt
 def main() -> NoReturn:
     """Move until the caller closes the input, or motion ends."""
     caller = Caller(0, os.dup(1))
-    library, end = os.pipe()
-    os.dup2(end, 1)
-    os.dup2(end, 2)
+    # ur_rtde prints; only answers may go to the pipe that the caller reads.
+    null = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, 1)
+    os.dup2(null, 2)
     try:
         message = caller.first()
         be_prompt(ASKS)
         if message is not None:
-            _serve(Setup.of(message), caller, library)
+            _serve(Setup.of(message), caller)
     except Exception as error:
         cause = LostError(f"{type(error).__name__}: {error}", device="robot")
         caller.tell("error", ended=True, **told(cause))
@@ -33,12 +34,12 @@ def main() -> NoReturn:
     os._exit(0)
 
 
-def _serve(setup: Setup, caller: Caller, library: int) -> NoReturn:
+def _serve(setup: Setup, caller: Caller) -> NoReturn:
     """Move, and end the process: at once, so that ur_rtde can neither reconnect nor wait.
 
     To return would call its destructor, which takes half a second.
     """
-    inputs = Inputs(caller, library, setup.clock)
+    inputs = Inputs(caller, setup.clock)
     gate = Gate(setup.plan, setup.confirmation, setup.clock)
     controller = Controller(setup, inputs, caller)
     connection = Connection(setup, gate, inputs, controller)

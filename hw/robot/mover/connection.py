@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import signal
+import socket
 import threading
+from contextlib import suppress
 
 from hw.robot.gate import Gate
 from hw.robot.identity import LOCAL, read_identity, stop_program, until_local
@@ -13,12 +16,14 @@ from hw.robot.mover.inputs import Inputs
 from hw.robot.mover.messages import Setup
 from hw.robot.mover.no_reconnect import NoReconnect
 from hw.robot.path_checks import check_plan
-from hw.robot.rtde import PROGRAM_RUNS, PacketReader, safety_text, state_text, too_late
+from hw.robot.rtde import PORT, PROGRAM_RUNS, PacketReader, safety_text, state_text, too_late
 from hw.runtime.clock import Lag
 from hw.runtime.errors import LostError, refused
 from hw.runtime.extras import require
 from hw.runtime.processes import ASKS, RECEIVES, be_prompt
 
+_START_S = 30.0
+"""Longest time for ur_rtde to connect."""
 _END_S = 5.0
 """Longest time for the end of the script and of the connection."""
 _DASHBOARD_S = 0.3
@@ -60,9 +65,12 @@ class Connection:
         self._gate.check_start(identity.name, offset, inputs.pendant)
         self._check_state(identity.remote)
         module = require("rtde_control", extra="robot")
+        before = set(os.listdir("/proc/self/fd"))
         self._no_reconnect = NoReconnect(setup.host)
         controller.log("connect", host=setup.host, serial=identity.name)
         try:
+            # A silent controller would hold this for ever, and the caller may be gone.
+            _end_within(_START_S)
             # The thread that ur_rtde starts inherits this priority.
             be_prompt(RECEIVES)
             controller.rtde_control = module.RTDEControlInterface(setup.host)
@@ -70,6 +78,8 @@ class Connection:
             raise LostError(said(error), device="robot") from None
         finally:
             be_prompt(ASKS)
+        _end_within(0.0)
+        controller.answers = _connection_among(set(os.listdir("/proc/self/fd")) - before)
         self._no_reconnect.begin()
         controller.watch_rest()
         if inputs.tcp_offset is None:
@@ -168,7 +178,23 @@ class Connection:
         return "; the program may be paused: stop it at the pendant before you reset the robot"
 
 
+def _connection_among(descriptors: set[str]) -> socket.socket:
+    """The one to the controller's real-time data.
+
+    Raises:
+        LostError: it is not among them, or is gone.
+    """
+    for number in descriptors:
+        # Another file, or a connection that has just ended.
+        with suppress(OSError):
+            found = socket.socket(fileno=os.dup(int(number)))
+            if found.getpeername()[1] == PORT:
+                return found
+            found.close()
+    raise LostError("the control connection was reset", device="robot")
+
+
 def _end_within(seconds: float) -> None:
-    """Let the system end this process after so long, whatever it hangs in."""
+    """Let the system end this process after so long, whatever it hangs in; 0: not any more."""
     if hasattr(signal, "setitimer"):
         signal.setitimer(signal.ITIMER_REAL, seconds)

@@ -7,14 +7,16 @@ How ur_rtde behaves, and what is done about it (each measured):
 - Calls to a silent controller hang, so the caller kills this process after a while, and the
   controller's own watchdog stops the robot 0.1 s after the last sign of life.
 - A connection that was reset is opened again, and the script sent again, without asking; so it is
-  kept from that (:mod:`hw.robot.mover.no_reconnect`), the text that it prints is watched, and a
-  reset ends the motion for good.
+  kept from that (:mod:`hw.robot.mover.no_reconnect`), and the system is asked about its connection:
+  a reset ends the motion for good, and so do lost answers.
 - A motion goes on after a disconnect, so the robot is stopped first.
 """
 
 from __future__ import annotations
 
 import math
+import socket
+import struct
 from typing import Any
 
 from hw.robot.mover.inputs import Ended, Inputs, lost
@@ -35,6 +37,11 @@ _REST_SEEN_S = 0.03
 _STOP_AGAIN_S = 0.05
 """stopL is sent again to a robot that still moves after this time."""
 STOP_PATIENCE_S = 2.0
+_TCP_INFO, _ESTABLISHED = struct.Struct("=B51xI"), 1
+"""State of a connection and milliseconds since its last data, in Linux's ``struct tcp_info``."""
+_UNHEARD_S = 0.5
+"""The controller's answers are lost if none came for so long (wall s), while poses come in time:
+sending a lost packet again takes 0.2 s."""
 _CAUSE_S = 0.1
 """The poses tell of a safety stop by so much later than the controller's program ends."""
 
@@ -53,6 +60,8 @@ class Controller:
         """Which robot is connected: :attr:`hw.robot.identity.Identity.name`."""
         self.rtde_control: Any = None
         """ur_rtde's interface; None before motion may begin, and in a dry run."""
+        self.answers: socket.socket | None = None
+        """The connection over which ur_rtde hears the controller."""
         self.local = False
         """Whether a person has switched the robot to local control."""
         self.kicks = 0
@@ -66,10 +75,31 @@ class Controller:
         """One command to the controller; every one is logged before it is sent.
 
         Raises:
-            Ended: the controller's program has stopped.
+            Ended: the controller's program has stopped, or its answers are lost.
         """
+        self.check_answers()
         self.log(name, values=values)
         return self._call(name, *values)
+
+    def check_answers(self) -> None:
+        """Check that ur_rtde hears the controller: its commands wait for answers for seconds.
+
+        Raises:
+            Ended: nothing came for :data:`_UNHEARD_S`.
+        """
+        if self._connection()[1] > 1000 * _UNHEARD_S:
+            raise Ended(lost("the controller's answers are lost"))
+
+    def _connection(self) -> tuple[int, int]:
+        """State of ur_rtde's connection, and for how long (ms) nothing came, read or not."""
+        assert self.answers is not None
+        info = self.answers.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _TCP_INFO.size)
+        return _TCP_INFO.unpack(info)
+
+    @property
+    def connected(self) -> bool:
+        """Whether the control connection stands; ur_rtde may notice later that it does not."""
+        return self.rtde_control.isConnected() and self._connection()[0] == _ESTABLISHED
 
     def _call(self, name: str, *values: object) -> object:
         if self._inputs.sample.age_s(self._clock.now()) > self._max_age_s:
@@ -165,7 +195,7 @@ class Controller:
         """Whether the controller takes commands; if not, calls of ur_rtde hang or reconnect."""
         return bool(
             self.rtde_control is not None
-            and self.rtde_control.isConnected()
+            and self.connected
             and self._inputs.packet.status_bits & PROGRAM_RUNS
             and not self._inputs.program_ended
             and not safety_text(self._inputs.packet.safety_bits)

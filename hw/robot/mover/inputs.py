@@ -1,4 +1,4 @@
-"""Everything that comes in (requests, packets, ur_rtde's messages), and the latch of a stop.
+"""Everything that comes in (requests and packets), and the latch of a stop.
 
 A stop cannot be lost: each line of input is handled as soon as it is read, whatever the process
 waits for. A request to stop is latched at once; a request to move waits in a queue. Only a
@@ -8,7 +8,6 @@ hesitation whose move was already answered is ignored.
 from __future__ import annotations
 
 import math
-import os
 import select
 from collections import deque
 from dataclasses import dataclass
@@ -18,8 +17,6 @@ from hw.robot.rtde import Packet, PacketReader, PendantSettings
 from hw.robot.stream import PoseSample, offset_changed
 from hw.runtime.clock import Clock, Lag
 from hw.runtime.errors import DeviceError, LostError, StaleError, StoppedError, refused
-
-_RECONNECTS = ("econnect", "Lost connection", "Could not receive", "closed the connection")
 
 
 @dataclass(frozen=True)
@@ -59,12 +56,11 @@ class Inputs:
 
     Args:
         caller: sends requests.
-        library: descriptor from which the text that ur_rtde prints is read.
         clock: bench time.
     """
 
-    def __init__(self, caller: Caller, library: int, clock: Clock) -> None:
-        self._caller, self._library, self._clock = caller, library, clock
+    def __init__(self, caller: Caller, clock: Clock) -> None:
+        self._caller, self._clock = caller, clock
         self._reader: PacketReader | None = None
         self._lag = Lag()
         self._packet: Packet | None = None
@@ -122,10 +118,10 @@ class Inputs:
         """Wait for any input, and handle everything that has come.
 
         Raises:
-            Ended: a connection to the controller is lost.
+            Ended: the connection to the controller is lost.
         """
         assert self._reader is not None
-        sources = [self._reader, self._library]
+        sources: list[PacketReader | Caller] = [self._reader]
         if not self._caller.left:
             sources.append(self._caller)
         ready = select.select(sources, [], [], timeout_s)[0]
@@ -136,11 +132,6 @@ class Inputs:
                 raise Ended(lost(error.args[0])) from None
             for packet in packets:
                 self._take_packet(packet)
-        if self._library in ready:
-            # A connection that was reset is opened again by ur_rtde, which asks nobody.
-            text = os.read(self._library, 65536).decode("utf-8", "replace")
-            if any(word in text for word in _RECONNECTS):
-                raise Ended(lost("the control connection was reset"))
         if self._caller in ready:
             for request in self._caller.read():
                 self._take_request(request)

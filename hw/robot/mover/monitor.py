@@ -42,7 +42,7 @@ class Monitor:
             moving: the motion that runs; None at rest.
 
         Raises:
-            Ended: the connection is lost.
+            Ended: the connection, or the answers that come over it, are lost.
         """
         inputs = self._inputs
         packets = inputs.unseen()
@@ -56,8 +56,8 @@ class Monitor:
             return _for_good(f"{LOCAL}; then confirm the plan again")
         if inputs.program_ended or not inputs.packet.status_bits & PROGRAM_RUNS:
             return Stop(self._controller.program_stopped(), True)
-        if not self._controller.rtde_control.isConnected():
-            return Stop(lost("the control connection is gone"), True)
+        if not self._controller.connected:
+            return Stop(lost("the control connection was reset"), True)
         if moving is None:
             return None
         sample, limits, now = inputs.sample, self._limits, self._clock.now()
@@ -65,6 +65,7 @@ class Monitor:
             return _hesitation(
                 f"no fresh pose: the newest is {sample.age_text(now)}; the motion was stopped"
             )
+        self._controller.check_answers()
         force = max(packet.force_n for packet in packets)
         if force > limits.max_force_n:
             return _for_good(f"a force of {force:.1f} N, over the cap of {limits.max_force_n:g} N")

@@ -2,8 +2,8 @@
 
 ur_rtde opens a connection that was reset again, in a thread of its own, and starts its program on
 the robot anew. That program has no watchdog yet, so it would stay on the robot when this process
-has ended. The text that ur_rtde prints meanwhile may be read too late: a command that waits for the
-controller holds the interpreter's lock. A connection needs a file descriptor, so this process is
+has ended. A reset may be noticed too late to prevent this: a command that waits for the controller
+holds the interpreter's lock. A connection needs a file descriptor, so this process is
 denied new ones while ur_rtde is connected, and ur_rtde's thread ends with an error instead.
 """
 

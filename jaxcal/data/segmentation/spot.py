@@ -22,8 +22,6 @@ from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy import ndimage
-from scipy.optimize import least_squares
 
 from jaxcal.data.segmentation.speckle import (
     HALF_MAXIMUM,
@@ -107,6 +105,8 @@ def local_maxima(values: Float[np.ndarray, "rows columns"]) -> Int[np.ndarray, "
     Returns:
         Rows and columns; equal heights are in the order of the rows.
     """
+    from scipy import ndimage
+
     top = values == ndimage.maximum_filter(values, size=3, mode="nearest")
     if top.all():
         return np.empty((0, 2), int)
@@ -121,6 +121,8 @@ def half_maximum(
 
     The variance of an evenly filled ellipse is a quarter of its squared half axis.
     """
+    from scipy import ndimage
+
     areas: Any = ndimage.label(envelope >= 0.5 * envelope[peak], structure=np.ones((3, 3)))
     labels = areas[0]
     shape = labels == labels[peak]
@@ -279,6 +281,8 @@ class _Fit:
 
     def solve(self) -> Float[np.ndarray, " unknowns"] | None:
         """The unknowns, or None where there is no solution."""
+        from scipy.optimize import least_squares
+
         derivative: Any = self.slope  # scipy's types know only the names of difference schemes
         with np.errstate(over="ignore", invalid="ignore"):
             try:
