@@ -180,9 +180,9 @@ def acquire(
                     _finish(recorder, job.images - estimator.count)
     except KeyboardInterrupt:
         # Ctrl-C once more, while everything was being closed: the pipe's end stops the robot. What
-        # waits for the disk is still written; a further Ctrl-C leaves at once.
+        # waits for the disk is still written; a further Ctrl-C ends the wait.
         interrupted, by_itself = True, False
-        with suppress(CalibrationError):
+        with suppress(CalibrationError, KeyboardInterrupt):
             recorder.close()
     if failure is not None:
         raise failure
