@@ -202,6 +202,8 @@ def test_lost_answers_end_motion_though_poses_come(robots):
     robot = robots["CB"]
     put_in_order(robot)
     with moving(robot, caller_s=2.0) as motion:
+        # Wherever the arm stands: the whole way takes twice as long as the loss is seen.
+        motion.move_to(PLAN.targets[0])
         fault = partial(robot.ask, "mute control", True)
         error, rest_s, told_s = fault_in_motion(robot, motion, fault)
         with pytest.raises(LostError, match="the controller's answers are lost"):
