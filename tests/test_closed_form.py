@@ -454,6 +454,8 @@ def test_a_list_of_any_size_compiles_nothing():
     for found, one in zip(answers[1].image_to_probe, lists[1], strict=True):
         alone = jaxcal.calibrate_closed_form(one)
         np.testing.assert_allclose(found, alone.image_to_probe, rtol=1e-9, atol=1e-9)
+    # To the longest no images were added.
+    np.testing.assert_array_equal(found, alone.image_to_probe)
 
 
 def test_callers_with_32_bits_get_64():

@@ -55,8 +55,8 @@ _BY_CHANCE = {
     "curve": 10.8,
     "beside": 9.5,
 }
-"""What 2 ln LR exceeds by chance in one of a thousand recordings: chi squared, and for m^2, which
-is never negative, that of two in a thousand."""
+"""What 2 ln LR exceeds by chance in one of a thousand recordings: chi squared, for m^2, which is
+never negative, that of two in a thousand, and for a step the limit of the module's head."""
 _MOST_STEPS = 16
 """Most places at which a step is tried, evenly spread."""
 _BESIDE_STEP = 3
