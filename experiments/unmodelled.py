@@ -1,7 +1,7 @@
 """Errors that the model leaves out: how often are they told of, and what becomes of the verdict?
 
 Simulated recordings (uniform offsets of SD 1 mm, noise level 1) without any fault and with one of
-seven, calibrated with the default prior:
+eight, calibrated with the default prior:
 
 - ``scale``: ranges 4 % too long (a sound speed of 1540 m/s in water of 1480 m/s);
 - ``skew``: lateral positions off by 3 % of the depth;
@@ -9,7 +9,10 @@ seven, calibrated with the default prior:
 - ``slip``: the image moves by 2 mm on the probe from the first image to the last;
 - ``second echo``: 40 % of the images, any of them, 5 mm too deep;
 - ``curve``: ranges too long by 1 mm 20 mm to the side, by the square of the lateral position;
-- ``step``: the image moves by 2 mm on the probe at once, before the last quarter of the images.
+- ``step``: the image moves by 2 mm on the probe at once, before the last quarter of the images;
+- ``distortion``: a piece of metal near the tracker moves the tracked positions by the field of a
+  dipole, 1 mm root mean square about its mean. It is 2.5 times as far from the middle of the
+  positions as these are (root mean square), anywhere, and points anywhere.
 
 For each: the share in which something is told of (a kind of error that the model leaves out, or
 two groups), in which it is the right thing, in which the verdict is good or fair, and in which it
@@ -40,14 +43,27 @@ from jaxcal.report.record import calibration_record
 from jaxcal.runtime.jax_cache import enable_compilation_cache
 
 SEED = 20261123
-FAULTS = ("none", "scale", "skew", "beside", "slip", "second echo", "curve", "step")
+FAULTS = ("none", "scale", "skew", "beside", "slip", "second echo", "curve", "step", "distortion")
 IMAGES = (12, 30, 60)
 STRETCH, SKEW, BESIDE_MM, SLIP_MM, ECHO_MM, ECHO_SHARE = 1.04, 0.03, 6.0, 2.0, 5.0, 0.4
-CURVE_MM = 1.0
+CURVE_MM, DISTORTION_MM, METAL = 1.0, 1.0, 2.5
 HEADER = [
     "fault", "images", "trials", "told_of", "right", "good_or_fair", "good_and_wrong",
     "stated_good_and_wrong",
 ]  # fmt: skip
+
+
+def dipole(key: Array, positions: Array) -> Array:
+    """By how much each position is moved, mm."""
+    apart = positions - positions.mean(axis=0)
+    place, moment = jax.random.normal(key, (2, 3))
+    far = METAL * jnp.sqrt(jnp.mean(jnp.sum(apart**2, axis=1)))
+    from_metal = apart - far * place / jnp.linalg.norm(place)
+    distance = jnp.linalg.norm(from_metal, axis=1, keepdims=True)
+    along = (from_metal @ moment)[:, None] * from_metal / distance**2
+    field = (3 * along - moment) / distance**3
+    field = field - field.mean(axis=0)
+    return DISTORTION_MM * field / jnp.sqrt(jnp.mean(jnp.sum(field**2, axis=1)))
 
 
 @partial(jax.jit, static_argnums=(0, 1))
@@ -79,6 +95,9 @@ def draw(images: int, fault: str, indices: Array):
             order = jax.random.permutation(jax.random.fold_in(key, 7), images)
             late = order < round(ECHO_SHARE * images)
             points = points.at[:, 1].add(ECHO_MM * late)
+        if fault == "distortion":
+            moved = dipole(jax.random.fold_in(key, 8), poses[:, :3, 3])
+            poses = poses.at[:, :3, 3].add(moved)
         if fault == "curve":
             points = points.at[:, 1].add(CURVE_MM * (points[:, 0] / SIDE_MM) ** 2)
         return poses, points, x, size

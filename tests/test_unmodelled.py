@@ -73,9 +73,19 @@ def slipped_at_once(recording: Recording) -> Recording:
     return slipped(recording, np.arange(IMAGES) >= 31)
 
 
+def distorted(recording: Recording) -> Recording:
+    """Tracked positions are off by 1 mm (RMS): a share of themselves that depends on direction."""
+    images = recording.calibration
+    poses = images.poses.copy()
+    apart = poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0)
+    off = apart @ np.random.default_rng(0).normal(size=(3, 3))
+    poses[:, :3, 3] += off / np.sqrt(np.mean(np.sum(off**2, axis=1)))
+    return replace(recording, calibration=make_images(poses, images.measurements))
+
+
 FAULTS = {
     "scale": wrong_scale, "skew": skewed, "curve": curved, "beside": beside, "slip": slipped,
-    "step": slipped_at_once,
+    "step": slipped_at_once, "distortion": distorted,
 }  # fmt: skip
 WORDS = {
     "scale": "check pixel size",
@@ -84,6 +94,7 @@ WORDS = {
     "beside": "beside the image plane in all images",
     "slip": "from the first image to the last",
     "step": "(counted from 0)",
+    "distortion": "tracked positions",
 }
 
 
@@ -104,6 +115,7 @@ def answers() -> dict[str, list[tuple[Recording, jaxcal.Calibration]]]:
     """All recordings that are not calibrated robustly, in one batch: one program."""
     sets = [(kind, IMAGES, map(fault, map(clean, range(4)))) for kind, fault in FAULTS.items()]
     sets.append(("echoes", IMAGES, [two_echoes()]))
+    sets.append(("neighbours", IMAGES, [neighbours(clean(seed), 2.0) for seed in range(100, 104)]))
     sets += [(f"clean {images}", images, map(clean, SEEDS)) for images in CLEAN]
     recordings, problems = {}, []
     for kind, images, these in sets:
@@ -138,6 +150,27 @@ def test_what_the_model_leaves_out_is_found_and_lowers_the_verdict(answers, kind
         np.testing.assert_allclose(middle, [1.5], atol=0.4)
     if kind == "beside":
         np.testing.assert_allclose(middle, [8.0], atol=2.0)
+    if kind == "distortion":
+        np.testing.assert_allclose(middle, [1.0], atol=0.4)
+
+
+def neighbours(recording: Recording, error_mm: float) -> Recording:
+    """Three images at the edge, turned about the target by 3 degrees, with one error in common."""
+    images, target = recording.calibration, recording.truth.point
+    poses, points = images.poses.copy(), images.measurements.copy()
+    edge = np.argmax(np.linalg.norm(poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0), axis=1))
+    rng = np.random.default_rng(0)
+    for row in (edge + np.arange(3)) % IMAGES:
+        turn = Rotation.from_rotvec(0.05 * rng.normal(size=3)).as_matrix()
+        poses[row, :3, :3] = turn @ images.poses[edge, :3, :3]
+        poses[row, :3, 3] = target + turn @ (images.poses[edge, :3, 3] - target)
+        points[row] = images.measurements[edge] + 0.05 * rng.normal(size=2) + [0.0, error_mm]
+    return replace(recording, calibration=make_images(poses, points))
+
+
+def test_a_few_neighbours_with_one_error_are_no_distortion(answers):
+    results = [result for _, result in answers["neighbours"]]
+    assert all("distortion" not in {each.kind for each in unmodelled(one)} for one in results)
 
 
 @pytest.mark.parametrize("images", CLEAN)

@@ -1,6 +1,6 @@
 """Would an error that the model leaves out explain the residuals better?
 
-Six are looked for, each with a few parameters theta, linearised at the answer:
+Six are looked for with a few parameters theta, linearised at the answer:
 
     scale   the pixels' sizes or the sound speed: x and r are too long by a share of themselves
     slip    X moves within the image plane, steadily in the course of the recording (elevational
@@ -22,6 +22,11 @@ places where the step may be. Its limit was found by simulation: Gaussian errors
 exceed 22 once in a thousand recordings, and errors that grow with depth 26 as often as they exceed
 the limit of a slip.
 
+A seventh, a distortion of the tracked positions, has a random field instead of few parameters
+(:mod:`jaxcal.diagnostics.tracker_distortion`). Its limit is from simulations with errors that grow
+with depth as well. Half of it must be exceeded without any neighbourhood, too: a few neighbours
+with an error in common imitate a distortion.
+
 References: Wilks 1938; Andrews 1993 (a change at an unknown place).
 """
 
@@ -32,6 +37,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jaxcal.diagnostics import tracker_distortion
 from jaxcal.diagnostics.image_errors import ImageErrors, Whitened
 from jaxcal.runtime.array_types import Bool, Float
 from jaxcal.runtime.arrays import map_arrays
@@ -54,9 +60,11 @@ _BY_CHANCE = {
     "skew": 10.8,
     "curve": 10.8,
     "beside": 9.5,
+    "distortion": 12.0,
 }
 """What 2 ln LR exceeds by chance in one of a thousand recordings: chi squared, for m^2, which is
-never negative, that of two in a thousand, and for a step the limit of the module's head."""
+never negative, that of two in a thousand, and for a step and a distortion the limits of the
+module's head."""
 _MOST_STEPS = 16
 """Most places at which a step is tried, evenly spread."""
 _BESIDE_STEP = 3
@@ -74,20 +82,21 @@ class Unmodelled:
     """An error that the model leaves out, and that the residuals show.
 
     Attributes:
-        kind: ``scale``, ``slip``, ``step``, ``skew``, ``curve`` or ``beside``.
+        kind: ``scale``, ``slip``, ``step``, ``skew``, ``curve``, ``beside`` or ``distortion``.
         values: its parameters: by which shares lateral positions and ranges are too long; motion of
             X from the first image to the last (lateral and axial, mm; about y, rad); by which share
             of the depth lateral positions are too large; by how many mm ranges are too long 20 mm
-            to the side; the distance m in mm.
+            to the side; the distance m in mm; the root mean square distortion in mm.
         statistic: 2 ln LR.
-        step: by how much the unknowns would change if it were corrected.
+        step: by how much the unknowns would change if it were corrected; of a distortion, by one SD
+            of each of its coefficients.
         image: the first one after a step, or None.
     """
 
     kind: str
     values: Float[Array, " k"]
     statistic: float
-    step: Float[Array, " p"]
+    step: Float[Array, " p *k"]
     image: int | None = None
 
     def moved(
@@ -115,7 +124,7 @@ class Unmodelled:
             slip = jacobian[..., _WITHIN] @ self.values
             # At the end of the recording.
             by = by + 0.5 * slip
-        size = [float(np.sqrt(np.mean(np.sum(each**2, axis=-1)))) for each in (by, slip)]
+        size = [float(np.sqrt(np.sum(each**2) / len(points))) for each in (by, slip)]
         return size[0], size[1]
 
 
@@ -154,6 +163,7 @@ def unmodelled(calibration: Calibration) -> list[Unmodelled]:
             each = _fit(kind, errors, part, before, int(used.sum()))
             if each is not None:
                 found.append(replace(each, image=image))
+        found += _distortion(answer, seen, used)
     return sorted(found, key=lambda each: -each.statistic / _BY_CHANCE[each.kind])
 
 
@@ -228,6 +238,28 @@ def _fit(
         # What has to be added is what is missing.
         values = -values
     return Unmodelled(kind, values, statistic, step)
+
+
+def _distortion(
+    answer: Calibration, seen: ImageErrors, used: Bool[Array, " n"]
+) -> list[Unmodelled]:
+    """A distortion of the tracked positions, if the residuals of the images show it."""
+    positions = np.asarray(seen.problem.poses)[0, :, :3, 3]
+    columns = tracker_distortion.columns(seen, used)
+    rows = np.concatenate([seen.rows[0], columns], axis=-1)[None]
+    whitened = Whitened.of(answer, replace(seen, rows=rows))
+    start = float(np.mean(np.asarray(answer.sigma)[0, :2] ** 2))
+    errors, rows = whitened.errors[0][used], whitened.rows[0][used]
+    found = tracker_distortion.fit(errors, rows, start)
+    if found is None or not found.statistic > _BY_CHANCE["distortion"]:
+        return []
+    for near in tracker_distortion.neighbourhoods(positions[used]):
+        rest = tracker_distortion.fit(errors[~near], rows[~near], start)
+        if rest is None or not rest.statistic > _BY_CHANCE["distortion"] / 2:
+            return []
+    size = tracker_distortion.size(positions, used, found.variance)
+    step = np.sqrt(found.variance) * found.response
+    return [Unmodelled("distortion", np.array([size]), found.statistic, step)]
 
 
 def _tuned(

@@ -162,6 +162,11 @@ def _from_unmodelled(record: dict[str, Any]) -> list[tuple[float, str]]:
             f"a target {values[0]:.1f} mm beside the image plane in all images would explain the "
             "errors far better: take images from both sides of it"
         ),
+        "distortion": lambda: (
+            f"tracked positions that are off by {values[0]:.1f} mm (RMS), by nearly the same where "
+            "the probe is nearly in the same place, would explain the errors far better: metal "
+            "near an electromagnetic tracker, or the edge of its range?"
+        ),
     }
     return [(math.hypot(1.0, moved / stated), words[found["kind"]]())]
 
