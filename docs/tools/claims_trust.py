@@ -238,7 +238,7 @@ claim(
 
 
 # Errors that the model leaves out.
-FAULTS = ("scale", "skew", "beside", "slip", "second echo", "curve", "step")
+FAULTS = ("scale", "skew", "beside", "slip", "second echo", "curve", "step", "distortion")
 
 
 def _left_out(of: str, *images: str) -> tuple[float, float]:

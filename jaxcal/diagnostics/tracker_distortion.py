@@ -44,7 +44,7 @@ _ROUNDS = 40
 
 
 def polynomials(positions: Float[Array, "n 3"], used: Bool[Array, " n"]) -> Float[Array, "n 9"]:
-    """The linear and quadratic polynomials phi of the positions; zeros if all are the same."""
+    """The linear and quadratic polynomials phi of the positions; constants if all are the same."""
     apart = positions - positions[used].mean(axis=0)
     spread = np.sqrt(np.mean(apart[used] ** 2))
     x, y, z = (apart / max(spread, 1e-300)).T

@@ -165,7 +165,8 @@ def _from_unmodelled(record: dict[str, Any]) -> list[tuple[float, str]]:
         "distortion": lambda: (
             f"tracked positions that are off by {values[0]:.1f} mm (RMS), by nearly the same where "
             "the probe is nearly in the same place, would explain the errors far better: metal "
-            "near an electromagnetic tracker, or the edge of its range?"
+            "near an electromagnetic tracker, the edge of its range, or, along a single path, "
+            "errors that change slowly? Record again without it: more images hardly help"
         ),
     }
     return [(math.hypot(1.0, moved / stated), words[found["kind"]]())]

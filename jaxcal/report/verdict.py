@@ -78,7 +78,7 @@ def headline(record: dict[str, Any]) -> str:
         return "Failed: there is no calibration."
     if record.get("wrong_frames"):
         told = record["wrong_frames"]
-        return f"Do not use: {told}" + "." * (not told.endswith("?"))
+        return f"Do not use: {_ended(told)}"
     if status == "unobservable":
         return "Do not use: these images do not determine the calibration."
     if status == "max_iterations":
@@ -116,14 +116,20 @@ def _mm(value: float | None) -> str:
     return "an unknown distance" if value is None else f"{value:{length_form(value)}} mm"
 
 
+def _ended(sentence: str) -> str:
+    """With a full stop, unless it is a question."""
+    return sentence + "." * (not sentence.endswith("?"))
+
+
 def why_larger(record: dict[str, Any]) -> list[str]:
     """Why the error is larger than the covariance states."""
     tre = record.get("tre")
     if tre is None or not tre.get("contradictions"):
         return []
+    contradicted = _ended("; ".join(tre["contradictions"]))
     return [
-        f"By the noise model alone the error would be {_mm(tre['stated_mm'])}, but "
-        f"{'; '.join(tre['contradictions'])}. The error above includes this."
+        f"By the noise model alone the error would be {_mm(tre['stated_mm'])}, but {contradicted} "
+        "The error above includes this."
     ]
 
 
