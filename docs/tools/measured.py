@@ -64,7 +64,7 @@ SETTINGS: dict[str, tuple[str, ...]] = {
         "outside a 99 % interval",
         "with 4 to 20 poses",
         "250 clean recordings for each of three distributions and 30, 54 and 200 images",
-        "1000 clean recordings each of 12, 30 and 60 images, and 200 each with one of seven faults",
+        "1000 clean recordings each of 12, 30 and 60 images, and 200 each with one of eight faults",
         "ranges 4 % too long",
         "one mm at 20 mm to the side",
         "400 recordings each of 12, 30 and 60 images, and ranges that are too long by 1 mm at 20 "
