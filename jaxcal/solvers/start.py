@@ -1,14 +1,8 @@
 """Where every method begins: a start in closed form, and the conventional fit from it.
 
-With r1 and r3 the lateral and axial columns of X's rotation, B_i X p_i = c of Eq. 7 is linear in
-(a1, a3, t, c) with a1 = s1 r1 and a3 = s3 r3:
-
-    R_i (u_i a1 + v_i a3 + t) + b_i - c = 0,         3 n equations, 12 unknowns,
-
-whether the pixel scales s are known or not: unknown scales are |a1| and |a3|. The images enter by
-sums only: the normal matrix of the 12 unknowns consists of sums of u, v, their products and the
-rotations. The 3x2 matrix [a1, a3] is projected to orthonormal columns (y = z cross x completes it,
-so no reflection can arise), and t and c (and unknown scales) follow from the same sums.
+(a1, a3) solve Eq. 7's normal equations (:mod:`jaxcal.solvers.closed_form.reduced_batch`). The 3x2
+matrix [a1, a3] is projected to orthonormal columns (y = z cross x completes it, so no reflection
+can arise), and t and c (and unknown scales) follow from the same sums.
 
 The system is singular where the poses or the points (all on a line in the image) determine fewer
 than 12 unknowns, and useless with few images and much noise. The constraint that X has a rotation
@@ -34,13 +28,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxcal.data.geometry import orthonormal_pair
-from jaxcal.model import unrolled
-from jaxcal.model.batch import ImagePlanes, Iterate, barrier, choose, total
+from jaxcal.model.batch import ImagePlanes, Iterate, barrier, choose
 from jaxcal.model.observations import InPlane
 from jaxcal.model.parameters import Parameters
 from jaxcal.model.unknowns import FURTHER, TABLE, Blocks
 from jaxcal.runtime.compiler import traced_once
 from jaxcal.solvers import dense
+from jaxcal.solvers.closed_form.reduced_batch import ReducedBatch
 from jaxcal.solvers.closed_form.single import Start
 from jaxcal.solvers.levenberg_marquardt import Minimum, minimise
 
@@ -74,159 +68,12 @@ class ConventionalStart(eqx.Module):
         return cls(None, Iterate.of(parameters, blocks), start.searched)
 
 
-class Reduced(eqx.Module):
-    """The least-squares problem of the start with c and t eliminated; batch axis last.
-
-    Half its objective is a'Qa / 2 - b'a, a = (a1, a3) in probe coordinates; points and pose origins
-    are relative to their means.
-
-    Attributes:
-        count: used images.
-        mean: of lateral position and range, mm.
-        face: range of pixel row 0, mm; the mean range includes it.
-        centre: of the poses' origins, mm.
-        matrix: Q.
-        rhs: b.
-        squares: sums of squares of lateral position and range, mm^2.
-        moments: sums of lateral times R_i and of range times R_i, side by side, mm.
-        rotation: sum of R_i.
-        centre_in_probes: sum of R_i'(centre - b_i), the centre in the probes' frames, mm.
-        origin_covariance: covariance of t for errors of variance 1, c eliminated.
-        smallest_pivot: smallest share of t's diagonal entries that is left when c and the rest of
-            t are eliminated.
-    """
-
-    count: Float[Array, " batch"]
-    mean: Float[Array, "2 batch"]
-    face: Float[Array, " batch"]
-    centre: Float[Array, "3 batch"]
-    matrix: Float[Array, "6 6 batch"]
-    rhs: Float[Array, "6 batch"]
-    squares: Float[Array, "2 batch"]
-    moments: Float[Array, "3 6 batch"]
-    rotation: Float[Array, "3 3 batch"]
-    centre_in_probes: Float[Array, "3 batch"]
-    origin_covariance: Float[Array, "3 3 batch"]
-    smallest_pivot: Float[Array, " batch"]
-
-    @classmethod
-    def of(cls, images: ImagePlanes) -> Reduced:
-        """Two passes over the images: the means, and the rest."""
-        count = images.used
-        points = [images.lateral, images.distance]
-        mean = [jnp.sum(images.mask * plane, axis=1) / count for plane in points]
-        centre = [jnp.sum(images.mask * plane, axis=1) / count for plane in images.origin]
-        x, z = (images.mask * (p - m[:, None]) for p, m in zip(points, mean, strict=True))
-        away = [c[:, None] - plane for plane, c in zip(images.origin, centre, strict=True)]
-        turn = [[images.rotation[3 * i + j] for j in range(3)] for i in range(3)]
-        back = unrolled.apply(unrolled.transpose(turn), away)
-        planes = [x * x, x * z, z * z]
-        for weight in (x, z, images.mask):
-            planes += [weight * entry for row in turn for entry in row]
-            planes += [weight * entry for entry in back]
-        sums = barrier(unrolled.as_array(total(planes)))
-        parts = sums[3:].reshape(3, 12, -1)
-        lateral, axial, rotation = parts[:, :9].reshape(3, 3, 3, -1)
-        moments = jnp.concatenate([lateral, axial], axis=1)
-
-        # c is the mean of B_i X p_i; then t.
-        def squared(first: Array, second: Array) -> Array:
-            return dense.product_batch_last(jnp.swapaxes(first, 0, 1), second) / count
-
-        eye = jnp.eye(3, dtype=x.dtype)[..., None]
-        ridge = 2e-12 + 32 * jnp.finfo(x.dtype).eps
-        own = barrier(count * (1 + ridge) * eye - squared(rotation, rotation))
-        origin_covariance, _ = dense.inverse_batch_last(own)
-        mixed = squared(rotation, moments)
-        follows = barrier(dense.product_batch_last(origin_covariance, mixed))
-        back_from_t = jnp.swapaxes(mixed, 0, 1)
-        # S (x) I: sums of squares and products of the points' coordinates.
-        square = jnp.stack([jnp.stack(sums[:2]), jnp.stack(sums[1:3])])
-        whole = square[:, None, :, None] * eye[None, :, None]
-        matrix = whole.reshape(6, 6, -1) - squared(moments, moments)
-        matrix = barrier(matrix - dense.product_batch_last(back_from_t, follows))
-        centre_in_probes = parts[2, 9:]
-        rhs = parts[:2, 9:].reshape(6, -1)
-        rhs = rhs + dense.product_batch_last(jnp.swapaxes(follows, 0, 1), centre_in_probes)
-        squares = jnp.stack([sums[0], sums[2]])
-        left = jnp.stack([count * origin_covariance[k, k] for k in range(3)])
-        return cls(
-            count,
-            jnp.stack(mean),
-            images.face,
-            jnp.stack(centre),
-            matrix,
-            rhs,
-            squares,
-            moments,
-            rotation,
-            centre_in_probes,
-            origin_covariance,
-            1 / jnp.max(left, axis=0),
-        )
-
-    def with_rotation(self, lateral: Array, axial: Array, blocks: Blocks) -> Iterate:
-        """X's origin, the target and free scales by linear least squares with X's rotation held.
-
-        Args:
-            lateral: its first column, (3, batch).
-            axial: its last column.
-            blocks: the free unknowns.
-        """
-        one = jnp.ones_like(self.count)
-        scale = jnp.stack([one, one])
-        if "scale" in blocks:
-            # A negative scale means a rotation far off; its magnitude still is the best guess.
-            tiny = jnp.finfo(one.dtype).tiny
-            scale = jnp.maximum(jnp.abs(self._scales(lateral, axial)), tiny)
-        columns = jnp.concatenate([scale[0] * lateral, scale[1] * axial])
-        seen = dense.product_batch_last(self.moments, columns)
-        pull = dense.product_batch_last(jnp.swapaxes(self.rotation, 0, 1), seen) / self.count
-        of_mean = barrier(
-            dense.product_batch_last(self.origin_covariance, self.centre_in_probes + pull)
-        )
-        target = seen + dense.product_batch_last(self.rotation, of_mean)
-        depth = scale[1] * (self.mean[1] - self.face) + self.face
-        free = {name: [TABLE[name].nominal * one] * TABLE[name].size for name in FURTHER}
-        free["scale"] = [*scale]
-        values = [value for name in FURTHER if name in blocks for value in free[name]]
-        return Iterate(
-            jnp.stack([lateral, jnp.cross(axial, lateral, axis=0), axial], axis=1),
-            of_mean - scale[0] * self.mean[0] * lateral - depth * axial,
-            self.centre + target / self.count,
-            jnp.stack(values) if values else jnp.zeros((0, *one.shape), one.dtype),
-            blocks,
-        )
-
-    def _scales(self, lateral: Array, axial: Array) -> Float[Array, "2 batch"]:
-        """The scales that fit best, given two columns of a rotation."""
-        forces = [
-            dense.product_batch_last(self.matrix[:, :3], lateral),
-            dense.product_batch_last(self.matrix[:, 3:], axial),
-        ]
-        first, mixed, second = (
-            jnp.sum(lateral * forces[0][:3], axis=0),
-            jnp.sum(axial * forces[0][3:], axis=0),
-            jnp.sum(axial * forces[1][3:], axis=0),
-        )
-        ridge = 16 * jnp.finfo(first.dtype).eps
-        held = jnp.where(self.squares > 0, ridge * self.squares, 1.0)
-        first, second = first + held[0], second + held[1]
-        right, deep = (
-            jnp.sum(lateral * self.rhs[:3], axis=0),
-            jnp.sum(axial * self.rhs[3:], axis=0),
-        )
-        determinant = first * second - mixed * mixed
-        return (
-            jnp.stack([second * right - mixed * deep, first * deep - mixed * right]) / determinant
-        )
-
-
 def closed_form(
     images: ImagePlanes, blocks: Blocks
-) -> tuple[Iterate, Bool[Array, " batch"], Reduced]:
+) -> tuple[Iterate, Bool[Array, " batch"], ReducedBatch]:
     """The start, whether it is sound, and the sums from which it is computed."""
-    sums = Reduced.of(images)
+    ridge = 2e-12 + 32 * float(jnp.finfo(images.mask.dtype).eps)
+    sums = ReducedBatch.of(images, ridge)
     inverse, _ = dense.inverse_batch_last(sums.matrix)
     columns = barrier(dense.product_batch_last(inverse, sums.rhs))
     left = jnp.stack([sums.squares[k // 3] * inverse[k, k] for k in range(6)])
@@ -243,7 +90,59 @@ def closed_form(
     a = jnp.where(sound, a / long, eye[:, :1])
     b = jnp.where(sound, b / deep, eye[:, 1:2])
     lateral, axial = orthonormal_pair(a, b)
-    return sums.with_rotation(lateral, axial, blocks), sound, sums
+    return _with_rotation(sums, lateral, axial, blocks), sound, sums
+
+
+def _with_rotation(reduced: ReducedBatch, lateral: Array, axial: Array, blocks: Blocks) -> Iterate:
+    """X's origin, the target and free scales by linear least squares with X's rotation held.
+
+    Args:
+        reduced: the sums over the images.
+        lateral: its first column, (3, batch).
+        axial: its last column.
+        blocks: the free unknowns.
+    """
+    one = jnp.ones_like(reduced.count)
+    scale = jnp.stack([one, one])
+    if "scale" in blocks:
+        # A negative scale means a rotation far off; its magnitude still is the best guess.
+        tiny = jnp.finfo(one.dtype).tiny
+        scale = jnp.maximum(jnp.abs(_scales(reduced, lateral, axial)), tiny)
+    columns = jnp.concatenate([scale[0] * lateral, scale[1] * axial])
+    of_mean, target = reduced.origin_and_target(columns)
+    depth = scale[1] * (reduced.mean[1] - reduced.face) + reduced.face
+    free = {name: [TABLE[name].nominal * one] * TABLE[name].size for name in FURTHER}
+    free["scale"] = [*scale]
+    values = [value for name in FURTHER if name in blocks for value in free[name]]
+    return Iterate(
+        jnp.stack([lateral, jnp.cross(axial, lateral, axis=0), axial], axis=1),
+        of_mean - scale[0] * reduced.mean[0] * lateral - depth * axial,
+        reduced.centre + target,
+        jnp.stack(values) if values else jnp.zeros((0, *one.shape), one.dtype),
+        blocks,
+    )
+
+
+def _scales(reduced: ReducedBatch, lateral: Array, axial: Array) -> Float[Array, "2 batch"]:
+    """The scales that fit best, given two columns of a rotation."""
+    forces = [
+        dense.product_batch_last(reduced.matrix[:, :3], lateral),
+        dense.product_batch_last(reduced.matrix[:, 3:], axial),
+    ]
+    first, mixed, second = (
+        jnp.sum(lateral * forces[0][:3], axis=0),
+        jnp.sum(axial * forces[0][3:], axis=0),
+        jnp.sum(axial * forces[1][3:], axis=0),
+    )
+    ridge = 16 * jnp.finfo(first.dtype).eps
+    held = jnp.where(reduced.squares > 0, ridge * reduced.squares, 1.0)
+    first, second = first + held[0], second + held[1]
+    right, deep = (
+        jnp.sum(lateral * reduced.rhs[:3], axis=0),
+        jnp.sum(axial * reduced.rhs[3:], axis=0),
+    )
+    determinant = first * second - mixed * mixed
+    return jnp.stack([second * right - mixed * deep, first * deep - mixed * right]) / determinant
 
 
 def conventional(
@@ -278,7 +177,7 @@ def conventional(
         index, best = state
         cube = cubes[jnp.maximum(index - 1, 0)]
         cube = jnp.broadcast_to(cube[..., None], (3, 3, images.batch_size))
-        first = choose(index == 0, start, sums.with_rotation(cube[:, 0], cube[:, 2], blocks))
+        first = choose(index == 0, start, _with_rotation(sums, cube[:, 0], cube[:, 2], blocks))
         fit = fit_from(barrier(first), observation, images)
         lower = (fit.cost < best.cost) | ~jnp.isfinite(best.cost)
         better = (index == 0) | (lower & ~sound)

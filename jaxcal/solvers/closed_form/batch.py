@@ -1,7 +1,7 @@
 """Closed-form conventional calibration of many problems at once, and its derivatives.
 
 The mathematics is that of :mod:`jaxcal.solvers.closed_form.single`, written for arrays whose last
-axis counts problems. The images enter by about fifty sums only. After that a problem is a 6x6
+axis counts problems. After :mod:`jaxcal.solvers.closed_form.reduced_batch` a problem is a 6x6
 matrix Q = C'C, a vector b = -C'g and the multipliers of its constraints:
 
     (Q + sum_j l_j A_j) x = b,    x' A_j x = e_j.
@@ -22,7 +22,6 @@ from __future__ import annotations
 
 from dataclasses import fields, replace
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -34,9 +33,11 @@ from jaxcal.data.geometry import orthonormal_pair
 from jaxcal.data.problem import Problem
 from jaxcal.data.recording import MINIMUM_IMAGES
 from jaxcal.model import unrolled
+from jaxcal.model.batch import ImagePlanes
 from jaxcal.model.unrolled import Matrix, Vector
 from jaxcal.runtime.arrays import is_traced, map_arrays
 from jaxcal.runtime.jax_modes import in_standard_promotion, own_modes, require_float64, with_dtype
+from jaxcal.solvers.closed_form.reduced_batch import ReducedBatch
 from jaxcal.solvers.closed_form.reduced_objective import (
     CONSTRAINTS,
     NEARBY,
@@ -156,59 +157,31 @@ def solve_traceable(problems: Problem, estimate: tuple[str, ...]) -> ClosedForm:
     """
     constraints = CONSTRAINTS[estimate]
     mask = (problems.mask > 0).astype(problems.poses.dtype)
-    used = problems.cleared(mask)
-    points = used.measurements * used.spacing[:, None, :]
-    scaled = constraints.scaled
-    if not scaled:
-        face = jnp.stack([jnp.zeros_like(used.face_offset), used.face_offset], axis=1)
-        points = points + face[:, None, :]
-    rotations, translations = used.poses[:, :, :3, :3], used.poses[:, :, :3, 3]
-    count = jnp.sum(mask, axis=1)
-    share = mask / count[:, None]
-    mean = jnp.einsum("bn,bnk->bk", share, points)
-    centre = jnp.einsum("bn,bnk->bk", share, translations)
-    deviation = mask[:, :, None] * (points - mean[:, None])
-    away = mask[:, :, None] * (translations - centre[:, None])
-    weights = jnp.concatenate([deviation, mask[:, :, None]], axis=2)
-    # Whole poses, and R'b plane by plane: batched products of 3x3 matrices are slow.
-    flat = used.poses.reshape(*mask.shape, 16)
-    sums = jnp.einsum("bnk,bnf->bkf", weights, flat).reshape(-1, 3, 4, 4)
-    rotation_sums = sums[:, :, :3, :3]
-    back = [sum(rotations[:, :, i, j] * away[:, :, i] for i in range(3)) for j in range(3)]
-    origin_sums = jnp.einsum("bnk,bnj->bkj", weights, jnp.stack(back, axis=2))
-    scatter = jnp.einsum("bnk,bnl->bkl", deviation, deviation)
-    size = jnp.sum(away**2, axis=(1, 2)) + scatter[:, 0, 0] + scatter[:, 1, 1]
-
-    full, rhs = _normal(
-        jnp.moveaxis(scatter, 0, -1),
-        jnp.moveaxis(rotation_sums, 0, -1),
-        jnp.moveaxis(origin_sums, 0, -1),
-        count,
-    )
-    matrix, vector, origin = _eliminate(full, rhs)
+    images = ImagePlanes.of(replace(problems.cleared(mask), mask=mask))
+    reduced = ReducedBatch.of(images)
+    matrix, vector, mean, count = reduced.matrix, reduced.rhs, reduced.mean, reduced.count
     x, values = _optimum(estimate, matrix, vector)
     x = _feasible(x, constraints)
     gap, least, definite = _gap(constraints, matrix, vector, x, values)
+    # Sums from singular normal equations of t prove nothing.
+    definite = definite & (reduced.smallest_pivot > SINGULAR)
 
-    of_mean = jnp.stack(origin(list(x)))
+    of_mean, target = reduced.origin_and_target(x)
+    scaled = constraints.scaled
     lengths = jnp.sqrt(jnp.sum(x.reshape(2, 3, -1) ** 2, axis=1))
     r1, r3 = x[:3] / lengths[0], x[3:] / lengths[1]
-    shift = of_mean - mean[:, 0] * x[:3] - mean[:, 1] * x[3:]
+    shift = of_mean - mean[0] * x[:3] - mean[1] * x[3:]
     if scaled:
-        shift = shift - used.face_offset * r3
-    # Plane by plane: batched products of such small matrices are slow.
-    of_points = shift + used.face_offset * r3 if scaled else shift
-    seen = [
-        points[:, :, 0] * x[i, :, None]
-        + points[:, :, 1] * x[3 + i, :, None]
-        + of_points[i, :, None]
-        for i in range(3)
-    ]
-    target, objective = [], jnp.zeros_like(count)
-    for i in range(3):
-        cloud = sum((rotations[:, :, i, j] * seen[j] for j in range(3)), translations[:, :, i])
-        target.append(jnp.sum(share * cloud, axis=1))
-        objective = objective + jnp.sum(mask * (cloud - target[i][:, None]) ** 2, axis=1)
+        # Pixel sizes do not stretch the range of row 0.
+        shift = shift + reduced.face * (x[3:] - r3)
+    lateral, axial = images.lateral - mean[0][:, None], images.distance - mean[1][:, None]
+    points = x[:3, :, None] * lateral + x[3:, :, None] * axial + of_mean[..., None]
+    turn = images.rotation.reshape(3, 3, *mask.shape)
+    away = images.origin - reduced.centre[..., None]
+    # Component by component: batched products of 3x3 matrices are slow.
+    residuals = sum((turn[:, j] * points[j] for j in range(3)), away - target[..., None])
+    objective = jnp.sum(mask * residuals**2, axis=(0, 2))
+    size = jnp.sum(mask * away**2, axis=(0, 2)) + jnp.sum(reduced.squares, axis=0)
     rotation = jnp.stack([r1, jnp.cross(r3, r1, axis=0), r3], axis=1)
     corner = jnp.zeros((len(mask), 4, 4), x.dtype).at[:, 3, 3].set(1.0)
     transform = corner.at[:, :3, :3].set(jnp.moveaxis(rotation, -1, 0)).at[:, :3, 3].set(shift.T)
@@ -220,8 +193,10 @@ def solve_traceable(problems: Problem, estimate: tuple[str, ...]) -> ClosedForm:
     alone = ball <= NEARBY**2 * least * jnp.sum(x * x, axis=0)
     return ClosedForm(
         image_to_probe=transform,
-        point_mm=jnp.stack(target, axis=1),
-        scale_mm_per_px=used.spacing * (lengths.T if scaled else 1.0) if used.pixels else None,
+        point_mm=(reduced.centre + target).T,
+        scale_mm_per_px=problems.spacing * (lengths.T if scaled else 1.0)
+        if problems.pixels
+        else None,
         sound_speed_factor=lengths[1] if constraints.free == ("axial",) else jnp.ones_like(count),
         rms_mm=jnp.sqrt(objective / count),
         objective_mm2=objective,
@@ -230,48 +205,6 @@ def solve_traceable(problems: Problem, estimate: tuple[str, ...]) -> ClosedForm:
         # M is positive definite, and so are the normal equations of t and c.
         unique=certified & alone,
     )
-
-
-def _normal(
-    scatter: Array, rotation_sums: Array, origin_sums: Array, count: Array
-) -> tuple[Matrix, Vector]:
-    """Normal equations of (a1, a3, t), c eliminated, as matrix and right side; batch axis last."""
-    size = 9
-    full: Matrix = [[0] * size for _ in range(size)]
-    for a in range(2):
-        for b in range(2):
-            for i in range(3):
-                full[3 * a + i][3 * b + i] = scatter[a, b]
-    for i in range(3):
-        full[6 + i][6 + i] = count
-    columns = [[rotation_sums[k, i, j] for k in range(3) for j in range(3)] for i in range(3)]
-    inverse = 1 / count
-    for p in range(size):
-        for q in range(p, size):
-            taken = sum(columns[i][p] * columns[i][q] for i in range(3)) * inverse
-            full[p][q] = full[q][p] = unrolled.add(full[p][q], -taken)
-    return full, [-origin_sums[k, j] for k in range(3) for j in range(3)]
-
-
-def _eliminate(full: Matrix, rhs: Vector) -> tuple[Array, Array, Any]:
-    """Eliminate t; Q, b, and t as a function of x."""
-    corner = [row[6:] for row in full[6:]]
-    factor, pivots = unrolled.cholesky(corner)
-
-    def half(column: Vector) -> Vector:
-        return unrolled.forward(factor, pivots, column)
-
-    halves = [half([full[6 + i][p] for i in range(3)]) for p in range(6)]
-    right = half(rhs[6:])
-    matrix = [[full[p][q] - unrolled.dot(halves[p], halves[q]) for q in range(6)] for p in range(6)]
-    vector = [rhs[p] - unrolled.dot(halves[p], right) for p in range(6)]
-
-    def origin(x: Vector) -> Vector:
-        known = [r - unrolled.dot([h[i] for h in halves], x) for i, r in enumerate(right)]
-        return unrolled.backward(factor, pivots, known)
-
-    stacked = jnp.stack([jnp.stack(row) for row in matrix])
-    return stacked, jnp.stack(vector), origin
 
 
 def _rows(stacked: Array) -> Matrix:
