@@ -166,6 +166,7 @@ import warnings
 import jax
 import numpy as np
 import jaxcal
+from jaxcal.data.problem import Channels
 from hw.acquisition.live_calibration import LiveCalibration
 from jaxcal import backend
 from jaxcal.study import run_study
@@ -316,7 +317,13 @@ for call, *given in (
         ("spacing", np.array([np.nan, 1.0])), ("spacing", np.ones(3)), ("face_offset", 0.0),
         ("mask", np.ones(5)), ("poses", poses[:, :3]), ("measurements", points.astype(str)),
         ("measurements", points.tolist()), ("measurements", None), ("max_elevation", np.ones(3)),
-        ("mask", np.full(9, 0.5)), ("mask", np.full(9, np.nan)),
+        ("mask", np.full(9, 0.5)), ("mask", np.full(9, np.nan)), ("max_elevation", -np.ones(9)),
+        ("covariance", np.tile(-np.eye(2), (9, 1, 1))), ("covariance", np.zeros((9, 2, 2))),
+        ("covariance", np.full((9, 2, 2), np.nan)), ("sound_speed", 1490.0),
+        ("sound_speed", np.array(1.49)), ("sound_speed", np.full(9, 1490.0)),
+        ("delay", np.array(np.nan)), ("channels", np.ones((9, 4))),
+        ("channels", Channels(np.ones((9, 4)), np.ones((9, 4)), np.ones((3, 3)))),
+        ("channels", Channels(np.full((9, 4), np.nan), np.ones((9, 4), bool), np.ones((4, 3)))),
     )),
     *((lambda dtype: jaxcal.Problem.from_arrays(poses, points, dtype=dtype), dtype)
       for dtype in (int, "points", np.longdouble)),
@@ -347,7 +354,7 @@ for call, *given in (
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stderr == ""
     lines = done.stdout.splitlines()
-    assert len(lines) == 196
+    assert len(lines) == 207
     assert lines[0].startswith("jaxcal.calibrate takes a problem, not a path: ")
     assert lines[3].startswith("jaxcal.calibrate_batch takes a problem or a recording, not int: ")
     assert lines[4] == "points must have shape (..., 2), not (1, 3)"

@@ -133,7 +133,7 @@ def calibrate(
         data: ``channels``: the joint method's residuals are those of every element's time of flight
             (the recording must hold them); ``points``: those of the segmented points; ``auto``:
             channels if they hold more information: on curvilinear probes and for sound speed or
-            delay.
+            delay. An image that no element heard is left out of ``channels``.
         sound_speed_sd: prior SD of the sound speed about its nominal value, m/s (joint method,
             except ``bounded``).
         delay_sd: prior SD of the delay about its nominal value, s (joint method, except
@@ -341,8 +341,14 @@ def prepare(
     problem = with_dtype(problem, np.dtype(options.precision))
     kind = check_request(request)
     _check_unknowns(problem, request)
-    channels = _uses_channels(problem, request, kind)
     dtype = problem.mask.dtype
+    channels = _uses_channels(problem, request, kind)
+    if channels and problem.channels is not None:
+        # Of an image that no element heard only the belief about its offset would be left.
+        heard = problem.channels.heard
+        silent = ~(array_module(heard).asarray(heard) > 0).any(axis=-1)
+        if is_traced(silent) or silent.any():
+            problem = replace(problem, mask=problem.mask * (1 - silent.astype(dtype)))
 
     def array(value: Any) -> AnyArray | None:
         # Plain numbers become numpy arrays, since JAX would compile their conversion.

@@ -50,8 +50,12 @@ def solve_problems(
     """
     if not plan.options.differentiate:
         problems, given = jax.lax.stop_gradient((problems, given))
-    is_mask = (problems.mask == 0) | (problems.mask == 1)
+    sound = (problems.mask == 0) | (problems.mask == 1)
     problems = problems.cleared(problems.mask)
+    if (covariance := problems.covariance) is not None:
+        sound &= (covariance[..., 0, 0] > 0) & (jnp.linalg.det(covariance) > 0)
+    if problems.max_elevation is not None:
+        sound &= problems.max_elevation >= 0
     if plan.robust:
         if agreed is None:
             # One problem at a time: its finalists fill the vector units, and several problems at
@@ -61,8 +65,9 @@ def solve_problems(
             seen = jax.lax.stop_gradient(problems.points_only())
             agreed = jax.vmap(jax.custom_batching.sequential_vmap(search))(seen)
         problems = replace(problems, mask=agreed)
-    # Where a mask holds anything but 0 and 1, the problem fails.
-    problems = replace(problems, mask=jnp.where(is_mask, problems.mask, jnp.nan))
+    # Where a mask holds anything but 0 and 1, or an image has no covariance or bound that could be
+    # one, the problem fails.
+    problems = replace(problems, mask=jnp.where(sound, problems.mask, jnp.nan))
     if not plan.one_by_one:
         return _solved(problems, given, plan, begun)
 

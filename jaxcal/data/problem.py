@@ -16,8 +16,17 @@ import numpy as np
 
 from jaxcal import InputError
 from jaxcal.data.probe import CurvilinearProbe
-from jaxcal.data.recording import MINIMUM_IMAGES, Images, Kind, Recording, images_of, make_images
-from jaxcal.data.sound import WATER_M_S
+from jaxcal.data.recording import (
+    MINIMUM_IMAGES,
+    Images,
+    Kind,
+    Recording,
+    checked_bound,
+    checked_covariance,
+    images_of,
+    make_images,
+)
+from jaxcal.data.sound import WATER_M_S, check_sound_speed
 from jaxcal.runtime.array_types import AnyArray, Float, HeldArray
 from jaxcal.runtime.arrays import (
     array_module,
@@ -40,6 +49,13 @@ _HOW = (
 )
 
 
+def _make_floating(tree: Channels | Problem) -> None:
+    """Booleans and whole numbers become floats: a mask given to dataclasses.replace, say."""
+    for name, value in vars(tree).items():
+        if getattr(getattr(value, "dtype", None), "kind", "") in ("b", "i", "u"):
+            object.__setattr__(tree, name, value.astype(float))
+
+
 @array_tree
 class Channels:
     """The distances that every element measured, for solvers that use times of flight directly.
@@ -54,6 +70,9 @@ class Channels:
     distances: Float[HeldArray, "*batch n elements"]
     heard: Float[HeldArray, "*batch n elements"]
     elements: Float[HeldArray, "*batch elements 3"]
+
+    def __post_init__(self) -> None:
+        _make_floating(self)
 
 
 @array_tree
@@ -96,10 +115,7 @@ class Problem:
     curved: bool = static(default=False)
 
     def __post_init__(self) -> None:
-        # dataclasses.replace(problem, mask=keep) with a mask of booleans, for example.
-        for name, value in vars(self).items():
-            if getattr(getattr(value, "dtype", None), "kind", "") in ("b", "i", "u"):
-                object.__setattr__(self, name, value.astype(float))
+        _make_floating(self)
 
     @property
     def images(self) -> int:
@@ -396,16 +412,27 @@ def check_shapes(problem: Problem) -> None:
     batch = shape[:-1]
     if not shape:
         raise InputError("mask of the problem must have an axis for the images")
-    for name, wanted, optional in (
-        ("mask", shape, False),
-        ("poses", (*shape, 4, 4), False),
-        ("measurements", (*shape, 2), False),
-        ("spacing", (*batch, 2), False),
-        ("face_offset", batch, False),
-        ("covariance", (*shape, 2, 2), True),
-        ("max_elevation", shape, True),
+    channels = problem.channels
+    if not isinstance(channels, Channels | None):
+        raise InputError(f"channels of the problem must be Channels, not {shown(channels)}")
+    elements = () if channels is None else np.shape(channels.distances)[-1:]
+    for holder, name, wanted, optional in (
+        (problem, "mask", shape, False),
+        (problem, "poses", (*shape, 4, 4), False),
+        (problem, "measurements", (*shape, 2), False),
+        (problem, "spacing", (*batch, 2), False),
+        (problem, "face_offset", batch, False),
+        (problem, "covariance", (*shape, 2, 2), True),
+        (problem, "max_elevation", shape, True),
+        (problem, "sound_speed", batch, True),
+        (problem, "delay", batch, True),
+        (channels, "distances", (*shape, *elements), False),
+        (channels, "heard", (*shape, *elements), False),
+        (channels, "elements", (*batch, *elements, 3), False),
     ):
-        value = getattr(problem, name)
+        if holder is None:
+            continue
+        value = getattr(holder, name)
         if value is None and optional:
             continue
         kind = getattr(getattr(value, "dtype", None), "kind", "")
@@ -422,8 +449,9 @@ def check_values(problem: Problem) -> None:
     """Refuse NaN, Inf and too few images, if the values are concrete.
 
     Raises:
-        InputError: a mask of other numbers than 0 and 1, NaN or Inf, with the number of the image,
-            too few images, or pixels without a size.
+        InputError: a mask of other numbers than 0 and 1, NaN or Inf, or what is no covariance or
+            no bound, with the number of the image; too few images; no size of pixels, no sound
+            speed.
     """
     if is_traced(problem):
         return
@@ -442,5 +470,17 @@ def check_values(problem: Problem) -> None:
     spacing = np.asarray(problem.spacing)
     if not (np.isfinite(spacing).all() and (spacing > 0).all()):
         raise InputError(f"spacing of the problem must be two positive numbers, not {spacing}")
-    if not np.isfinite(np.asarray(problem.face_offset)):
-        raise InputError("face_offset of the problem must be finite")
+    for name in ("face_offset", "delay"):
+        value = getattr(problem, name)
+        if value is not None and not np.isfinite(np.asarray(value)):
+            raise InputError(f"{name} of the problem must be finite")
+    if problem.sound_speed is not None:
+        check_sound_speed(float(np.asarray(problem.sound_speed)))
+    checked_covariance(problem.covariance, len(used), used)
+    checked_bound(problem.max_elevation, len(used), used)
+    channels = problem.channels
+    if channels is not None:
+        heard = used[:, None] & (np.asarray(channels.heard) > 0)
+        bad = (heard & ~np.isfinite(np.asarray(channels.distances))).any(axis=1)
+        if bad.any():
+            raise InputError(f"distances of image {np.flatnonzero(bad)[0]} hold NaN or Inf")

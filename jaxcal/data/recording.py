@@ -318,8 +318,8 @@ def make_images(
             measurements=values,
             kind=kind,
             mask=used,
-            covariance=_covariance(covariance, count, used),
-            max_elevation=_bound(max_elevation, count, used),
+            covariance=checked_covariance(covariance, count, used),
+            max_elevation=checked_bound(max_elevation, count, used),
             amplitude=_per_image("amplitude", amplitude, count, used, fill=0.0),
             time=_per_image("time", time, count, used, fill=0.0),
             spacing_mm=spacing,
@@ -449,8 +449,14 @@ def _check_inside(pixels: np.ndarray, size: tuple[int, int], used: np.ndarray) -
         )
 
 
-def _bound(max_elevation: Any, count: int, used: np.ndarray) -> Float[np.ndarray, " n"] | None:
-    """Every image's bound on its offset, from one or from as many as there are images."""
+def checked_bound(
+    max_elevation: Any, count: int, used: np.ndarray
+) -> Float[np.ndarray, " n"] | None:
+    """Every image's bound on its offset, from one or from as many as there are images.
+
+    Raises:
+        InputError: what is no bound of a used image; the row is named.
+    """
     if max_elevation is not None and np.ndim(max_elevation) == 0:
         max_elevation = np.full(count, real_array(max_elevation, "max_elevation"))
     bound = _per_image("max_elevation", max_elevation, count, used, fill=1.0)
@@ -519,9 +525,14 @@ def _frame(values: np.ndarray | None, count: int) -> Int[np.ndarray, " n"] | Non
     return numbers.astype(np.int64)
 
 
-def _covariance(
-    covariance: np.ndarray | None, count: int, used: np.ndarray
+def checked_covariance(
+    covariance: Any, count: int, used: np.ndarray
 ) -> Float[np.ndarray, "n 2 2"] | None:
+    """The covariances, made exactly symmetric, and the identity for images left out.
+
+    Raises:
+        InputError: what is no covariance of a used image; the row is named.
+    """
     if covariance is None:
         return None
     values = _shaped(covariance, "covariance", (count, 2, 2))

@@ -128,7 +128,9 @@ def transform_intervals(
 
     Returns:
         Along the image's lateral, elevational and axial axes in mm, then about them in rad; NaN
-        where X is not observable.
+        where X is not observable. Those of the conventional method assume errors of one size along
+        all three axes: where offsets are larger than the errors of the points, they are too short
+        for rotations about the lateral and axial axes.
 
     Raises:
         InputError: a level that is not between 0 and 1.
