@@ -212,6 +212,22 @@ def test_lost_answers_end_motion_though_poses_come(robots):
         assert told_s < 1.5
 
 
+def test_answers_lost_while_a_command_waits_are_told_as_soon(robots):
+    """The command holds the interpreter's lock of the process that sent it for seconds."""
+    robot = robots["e"]
+    put_in_order(robot)
+    with moving(robot, caller_s=2.0) as motion:
+        target = farther(robot)
+        robot.ask("mute control", True)
+        moves, before = len(sent(robot, 3)), robot.clock.now()
+        with pytest.raises(LostError, match=r"answers are lost; .* needs a new confirmation"):
+            motion.move_to(target)
+        assert robot.clock.now() - before < 1.5
+        with pytest.raises(RefusedError, match="confirm the plan again"):
+            motion.move_to(target)
+        assert len(sent(robot, 3)) == moves
+
+
 @pytest.mark.parametrize("dashboard", [None, ""], ids=["answers", "mute"])
 def test_a_motion_does_not_go_on_when_a_safeguard_stop_is_released(robots, dashboard):
     """Such a stop only pauses the program, and may be released by closing a gate."""

@@ -157,10 +157,7 @@ class Connection:
     def end_script(self) -> None:
         """End our program; the robot must rest."""
         self._controller.log("kickWatchdog", times=self._controller.kicks)
-        # Calls to a controller that is gone may hang, and nobody kills this process if the caller
-        # is gone, too. The robot rests by now.
-        _end_within(_END_S)
-        self._controller.command("stopScript")
+        self._controller.command("stopScript", within_s=_END_S)
 
     def end_paused(self) -> str:
         """End a program that a safety stop has paused: it might go on when the stop is released.
