@@ -101,9 +101,9 @@ def put_in_order(robot: EmulatedRobot) -> None:
     robot.ask("force", [0.0] * 6)
 
 
-def kill_mover(motion: Motion) -> None:
+def signal_mover(motion: Motion, number: signal.Signals) -> None:
     assert motion._process is not None
-    os.kill(motion._process.pid, signal.SIGKILL)
+    os.kill(motion._process.pid, number)
 
 
 FAULTS = [
@@ -115,6 +115,7 @@ FAULTS = [
     ("kill", BOTH, LostError, "motion process ended", True),
     ("silent", BOTH, StaleError, "the caller was silent", False),
     # The same stop for another reason.
+    ("end", ["CB"], StoppedError, r"process was asked to end \(SIGTERM\)", True),
     ("hesitation", ["CB"], StaleError, "no frame for 0.2 s", False),
     ("protective_stop", ["CB"], StoppedError, "protective stop: find its cause", True),
     ("off", ["CB"], StoppedError, "powered off: switch the robot on and release", True),
@@ -156,7 +157,8 @@ def check_fault(robot: EmulatedRobot, name: str, kind: type, text: str, ends: bo
             ),
             "silent": lambda: reasons.__setitem__(0, "silent"),
             "stop": lambda: motion.stop("the operator pressed stop"),
-            "kill": lambda: kill_mover(motion),
+            "kill": lambda: signal_mover(motion, signal.SIGKILL),
+            "end": lambda: signal_mover(motion, signal.SIGTERM),
             "force": lambda: robot.ask("force", [0.0, 0.0, -40.0, 0.0, 0.0, 0.0]),
             "tcp_offset": lambda: robot.ask(name, [0.0, 0.0, 0.2, 0.0, 0.0, 0.0]),
             "off": lambda: robot.ask("robot_state", 3, 1),
@@ -172,6 +174,9 @@ def check_fault(robot: EmulatedRobot, name: str, kind: type, text: str, ends: bo
             raise error
         assert rest_s <= STOP_WITHIN_S
         assert told_s < 5.0
+        if name == "end":
+            # In order, not by the controller's watchdog.
+            assert robot.state()["reason"] == "the client stopped the script"
         reasons[0] = None
         moves = len(sent(robot, 3))
         if ends:
