@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import queue
+import re
 import signal
 import subprocess
 import sys
@@ -255,6 +256,27 @@ def test_a_motion_does_not_go_on_when_a_safeguard_stop_is_released(robots, dashb
             assert robot.state()["raw"] == stood
         with pytest.raises(RefusedError, match="confirm the plan again"):
             motion.move_to(HOME)
+
+
+def test_of_two_that_connect_at_once_one_moves_the_robot(robots):
+    robot = robots["e"]
+    put_in_order(robot)
+    moves = len(sent(robot, 3))
+    target = farther(robot)
+
+    def move() -> str:
+        try:
+            with moving(robot, caller_s=2.0) as motion:
+                motion.move_to(target)
+                return "arrived"
+        except DeviceError as error:
+            return str(error)
+
+    with ThreadPoolExecutor(2) as pool:
+        told = sorted(pool.map(lambda _: move(), range(2)))
+    assert told[0] == "arrived"
+    assert re.search("another program commands this robot|a program runs on the robot", told[1])
+    assert len(sent(robot, 3)) == moves + 1
 
 
 TAKEN_OVER = {

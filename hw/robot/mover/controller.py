@@ -247,4 +247,7 @@ def unfit(packet: Packet) -> StoppedError | None:
 
 def said(error: RuntimeError) -> str:
     """An error of ur_rtde; some of its texts begin with its name."""
+    if "registers are already in use" in str(error):
+        # Its own text speaks of fieldbuses alone.
+        return "another program commands this robot, or a fieldbus uses its RTDE input registers"
     return f"ur_rtde: {str(error).removeprefix('ur_rtde: ')}"

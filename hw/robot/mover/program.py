@@ -17,6 +17,7 @@ import socket
 from collections.abc import Callable
 from typing import Any
 
+from hw.robot.mover.controller import said
 from hw.runtime.errors import LostError
 from hw.runtime.processes import be_prompt
 
@@ -45,7 +46,7 @@ def guarded_program(module: Any, host: str, watchdog_hz: float) -> bytes:
         try:
             text = _text_of(module, host)
         except (RuntimeError, OSError) as error:
-            text = f"{error}".encode()
+            text = (said(error) if isinstance(error, RuntimeError) else str(error)).encode()
         with open(write, "wb") as out:
             out.write(text)
         # To return would call ur_rtde's destructor, which takes half a second.
@@ -55,8 +56,8 @@ def guarded_program(module: Any, host: str, watchdog_hz: float) -> bytes:
         text = source.read()
     os.waitpid(child, 0)
     if not text.endswith(_LAST_LINE):
-        why = " ".join(text[-200:].decode("utf-8", "replace").split()) or "no answer"
-        raise LostError(f"ur_rtde does not give its program: {why}", device="robot")
+        why = " ".join(text[:200].decode("utf-8", "replace").split()) or "no answer"
+        raise LostError(f"no program to send to the controller: {why}", device="robot")
     watch = f'    rtde_set_watchdog("input_int_register_0", {watchdog_hz:g}, "stop")\n'
     return b"def rtde_control():\n" + watch.encode() + text + b"end\n"
 
