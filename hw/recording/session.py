@@ -325,7 +325,7 @@ class Session:
     def is_of_the_way(self, image: Image) -> bool:
         """Whether the same image, to the last pixel, came before the arm came to rest."""
         with self._changed:
-            first = self._first_seen.get(zlib.crc32(image.array), image.t_host)
+            first = self._first_seen.get(zlib.crc32(image.array.tobytes()), image.t_host)
             return first <= self._moved_s
 
     def record_image(self) -> None:
@@ -365,7 +365,7 @@ class Session:
                 self._echo_seen = frames[-1].t_host
             for image in images:
                 self._image, self._image_seen = image, image.t_host
-                digest = zlib.crc32(image.array)
+                digest = zlib.crc32(image.array.tobytes())
                 # Those that come again are kept longest.
                 first = self._first_seen.pop(digest, image.t_host)
                 self._first_seen[digest] = first
