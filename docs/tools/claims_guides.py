@@ -32,6 +32,25 @@ claim(
     "{:.0f} of {:,.0f} stops were lost",
     lambda: [sum(number(row, name) for row in table("stops")) for name in ("lost", "trials")],
 )
+
+_PROMPT = [row for row in table("robot_faults") if row["fault"] != "lost answers"]
+claim(
+    SAFETY,
+    "After {:.0f} faults the robot was at rest within {:.0f} ms",
+    lambda: [
+        sum(number(row, "repeats") for row in _PROMPT),
+        max(number(row, "rest_max_ms") for row in _PROMPT),
+    ],
+)
+claim(
+    SAFETY,
+    "answers were lost, within {:.0f} ms",
+    lambda: [
+        number(row, "rest_max_ms")
+        for row in table("robot_faults")
+        if row["fault"] == "lost answers"
+    ],
+)
 claim(
     POSES,
     "errors of plans are at most {:.1f} % above",

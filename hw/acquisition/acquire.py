@@ -154,30 +154,38 @@ def acquire(
     recorder = open_recorder(path, job)
     reason, interrupted, by_itself = "interrupted", False, False
     failure: Exception | None = None
+
+    def note_end() -> None:
+        # Motion has ended by now: no process of ours moves the robot any more.
+        with suppress(CalibrationError):
+            recorder.add_event("stopped", reason, setup.clock.now())
+            if job.progress is not None and job.progress.ended:
+                # It was complete before this run, and stays so.
+                if emulated is not None:
+                    _write_truth(recorder, emulated)
+                _finish(recorder, job.images - estimator.count)
+
     try:
         with _closing(recorder):
             try:
-                run = _Run(
-                    job, recorder, estimator, say, emulated, operator, pause, view or Audience()
-                )
-                return run.outcome(confirm, watch)
+                try:
+                    run = _Run(
+                        job, recorder, estimator, say, emulated, operator, pause, view or Audience()
+                    )
+                    return run.outcome(confirm, watch)
+                except (DeviceError, CalibrationError) as error:
+                    reason = str(error)
+                    # A stream that hesitated or a watchdog that tripped: a person would only try
+                    # again.
+                    by_itself = isinstance(error, StaleError | LostError)
+                except Exception as error:
+                    # Standard error is gone, or a fault of this program: for the caller to report.
+                    reason, failure = f"{type(error).__name__}: {error}", error
+                note_end()
             except KeyboardInterrupt:
-                interrupted = True
-            except (DeviceError, CalibrationError) as error:
-                reason = str(error)
-                # A stream that hesitated or a watchdog that tripped: a person would only try again.
-                by_itself = isinstance(error, StaleError | LostError)
-            except Exception as error:
-                # Standard error is gone, or a fault of this program: for the caller to report.
-                reason, failure = f"{type(error).__name__}: {error}", error
-            # Motion has ended by now: no process of ours moves the robot any more.
-            with suppress(CalibrationError):
-                recorder.add_event("stopped", reason, setup.clock.now())
-                if job.progress is not None and job.progress.ended:
-                    # It was complete before this run, and stays so.
-                    if emulated is not None:
-                        _write_truth(recorder, emulated)
-                    _finish(recorder, job.images - estimator.count)
+                # Also while the end for another reason was noted.
+                interrupted, by_itself = True, False
+                note_end()
     except KeyboardInterrupt:
         # Ctrl-C once more, while everything was being closed: the pipe's end stops the robot. What
         # waits for the disk is still written; a further Ctrl-C ends the wait.

@@ -17,7 +17,7 @@ from hw.recording.session import Session
 from hw.robot.motion import Motion
 from hw.robot.stream import PoseSample
 from hw.runtime.errors import RefusedError, StaleError, refused
-from hw.runtime.rigid import turn_deg
+from hw.runtime.rigid import apart
 from hw.ultrasound.receiver import Image
 from jaxcal.data.segmentation.image import localise
 from jaxcal.runtime.array_types import Float
@@ -56,8 +56,6 @@ class ProbeStage:
         self._session, self._motion, self._note = session, motion, note
         self._axis = np.asarray(session.setup.scene.elevational, float)
         self.plan_pose = np.eye(4)
-        self._before: Image | None = None
-        """The newest image before the last journey."""
         self._arrived = session.clock.now()
         self._rests_at: np.ndarray | None = None
         """Pose in which the last move ended."""
@@ -73,7 +71,6 @@ class ProbeStage:
             DeviceError: stopped, refused, lost, or a device in lasting trouble.
         """
         self.plan_pose = self._targets[row].copy()
-        self._before = self._session.latest_image()
         try:
             self._move(self.plan_pose, None)
             return
@@ -81,7 +78,7 @@ class ProbeStage:
             if self._motion.ended:  # refused while it moved, for good: no other way helps
                 raise
             here = self._session.poses.latest().pose
-            near = int(np.argmin([_apart(here, pose) for pose in self._targets]))
+            near = int(np.argmin([apart(here, pose) for pose in self._targets]))
             if near == row:
                 raise
             self._note("detour", f"{error}; through poses {near + 1} to {row + 1} of the plan")
@@ -189,10 +186,10 @@ class ProbeStage:
             place, within = self._expected_px(row, image)
             found = localise(image.array, "cross", near=place, within_px=within)
             if found.found[0]:
-                if self._before is not None and np.array_equal(image.array, self._before.array):
+                if self._session.is_of_the_way(image):
                     raise StaleError(
-                        "the image is still that from before the probe moved: is the machine "
-                        "frozen?",
+                        "the image is still that from before the probe came to rest: is the "
+                        "machine frozen?",
                         device="ultrasound",
                     )
                 contrast = float(found.contrast_db[0])
@@ -222,7 +219,7 @@ class ProbeStage:
             DeviceError: the connection was lost, or too few poses came.
         """
         pose = self._session.poses.steady(seconds).sample.pose
-        drift = 0.0 if self._rests_at is None else _apart(self._rests_at, pose)
+        drift = 0.0 if self._rests_at is None else apart(self._rests_at, pose)
         if drift > _DRIFT_MM:
             raise refused(
                 f"the pose changed by {drift:.1f} mm or degrees while the robot was at rest: set "
@@ -248,8 +245,3 @@ class ProbeStage:
             self._arrived, self._rests_at = self._session.clock.now(), sample.pose
             return sample
         raise AssertionError
-
-
-def _apart(first: np.ndarray, second: np.ndarray) -> float:
-    """Distance of two poses, mm; a degree counts as a mm."""
-    return float(np.linalg.norm(first[:3, 3] - second[:3, 3])) + turn_deg(first, second)

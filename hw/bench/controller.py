@@ -4,11 +4,15 @@ The client writes a command into input_int_register_0 and its numbers into the d
 program answers in output_int_register_0: 1 ready, 2 done; it goes back to 1 when the client has
 written 0. Real-time commands are executed at every step and leave the register at 1. While a
 synchronous motion runs, the program reads no commands, as on the real controller.
+
+This loop is not read from the script that was sent; of the script, only what comes before the loop
+is interpreted, as far as it concerns a watchdog (:func:`before_loop`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from hw.bench.arm import Arm
@@ -53,6 +57,30 @@ STEADY_S = 0.5
 """How long the arm must have rested to count as steady (URScript manual, is_steady)."""
 
 
+_BLOCK = re.compile(r"(def|thread|while|for|if)\b")
+_WATCHDOG = re.compile(r'rtde_set_watchdog\("(\w+)",\s*([\d.]+),\s*"(\w+)"\)$')
+
+
+def before_loop(script: str) -> list[str] | None:
+    """The statements that a script executes before its first block, e.g. its main loop.
+
+    Definitions are not executed where they stand. Returns None if a block is not closed, so that
+    the script cannot be run.
+    """
+    found: list[str] = []
+    depth, looped = 0, False
+    for line in script.splitlines():
+        statement = line.partition("#")[0].strip()
+        if _BLOCK.match(statement):
+            looped |= depth == 1 and not statement.startswith(("def", "thread"))
+            depth += 1
+        elif statement == "end":
+            depth -= 1
+        elif statement and depth == 1 and not looped:
+            found.append(statement)
+    return None if depth else found
+
+
 @dataclass
 class Controller:
     """State of the controller; every method takes bench time (s)."""
@@ -83,6 +111,7 @@ class Controller:
     """Called when a program stops: the reason, and whether it is a fault of the program."""
 
     _starts: float | None = None
+    _first: Sequence[str] = ()
     _plays: bool = False
     _paused_move: tuple[list[float], float, float] | None = None
     _latched: bool = False
@@ -99,6 +128,11 @@ class Controller:
         if self.safety_mode in (PROTECTIVE, SAFEGUARD):
             return PAUSED
         return PLAYING if self.running else STOPPED
+
+    @property
+    def loading(self) -> bool:
+        """Whether a program was sent that does not run yet."""
+        return self._starts is not None
 
     @property
     def fit(self) -> bool:
@@ -145,12 +179,17 @@ class Controller:
                 self._finishes = self.arm.move_linear(t, pose, speed, acceleration)
                 self._paused_move = None
 
-    def upload(self, t: float) -> None:
-        """A script has come: it replaces the one that runs, if the robot takes scripts now."""
+    def upload(self, t: float, first: Sequence[str] = ()) -> None:
+        """A script has come: it replaces the one that runs, if the robot takes scripts now.
+
+        Args:
+            t: bench time (s).
+            first: the statements before its main loop.
+        """
         if not (self.remote and self.fit):
             return
         self.halt(t, "another script was sent")
-        self._starts, self._plays = t + _START_S, False
+        self._starts, self._plays, self._first = t + _START_S, False, first
 
     def play(self, t: float) -> None:
         """A person starts another program, which runs once it is loaded."""
@@ -220,6 +259,19 @@ class Controller:
         self.int_in[0] = 0
         self.int_out[0] = READY
         self._progress(-1)
+        for statement in self._first:
+            if statement.startswith("rtde_set_watchdog"):
+                self._set_watchdog(t, statement)
+
+    def _set_watchdog(self, t: float, statement: str) -> None:
+        match = _WATCHDOG.match(statement)
+        if match is None or match[1] != "input_int_register_0" or match[3] != "stop":
+            self.halt(t, f"{statement} is not emulated", fault=True)
+        else:
+            self._watch(t, float(match[2]))
+
+    def _watch(self, t: float, least_hz: float) -> None:
+        self._watchdog_s, self._kicked = (1.0 / least_hz if least_hz > 0 else None), t
 
     def _execute(self, t: float, command: int) -> None:
         d = self.double_in
@@ -241,8 +293,7 @@ class Controller:
             case 31:
                 self.protect(t)
             case 35:
-                self._watchdog_s = 1.0 / d[0] if d[0] > 0 else None
-                self._kicked = t
+                self._watch(t, d[0])
             case 36:
                 self.int_out[1] = int(self.arm.within_reach(d[:6]))
             case 40:

@@ -181,6 +181,7 @@ def _state(robot: RtdeServer) -> dict:
         "joints": arm.joints(t),
         "velocity": arm.velocity(t),
         "rest_since": arm.rest_since(t),
+        "loading": program.loading,
         "running": program.running,
         "reason": program.reason,
         "log": program.log,

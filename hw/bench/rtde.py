@@ -33,7 +33,7 @@ from concurrent.futures import Future
 from typing import Any
 
 from hw.bench.arm import Arm
-from hw.bench.controller import NORMAL, Controller
+from hw.bench.controller import NORMAL, Controller, before_loop
 from hw.bench.rtde_fields import INPUTS, OUTPUTS, STRUCT, output_type
 from hw.robot.identity import (
     DASHBOARD_PORT,
@@ -551,10 +551,12 @@ class RtdeServer:
     # Scripts and dashboard
 
     def _script(self, connection: _Connection) -> None:
-        text = connection.received
-        if text.lstrip().startswith(b"def rtde_control") and text.rstrip().endswith(b"end"):
-            self.controller.upload(self.clock.now())
-            text.clear()
+        text = connection.received.decode("utf-8", "replace")
+        if text.lstrip().startswith("def rtde_control") and text.rstrip().endswith("end"):
+            first = before_loop(text)
+            if first is not None:
+                self.controller.upload(self.clock.now(), first)
+                connection.received.clear()
 
     def _dashboard(self, connection: _Connection) -> None:
         data = connection.received

@@ -24,6 +24,9 @@ from jaxcal.runtime.array_types import Float
 
 _COLUMN_NAMES, _ROW_NAMES = ("left", "middle", "right"), ("upper", "central", "lower")
 _LEAST_IN_CELL = 1
+_AT_REST = 0.25
+"""While the pose is still, the target may move in the image by so much of what makes an image
+differ: 3 % of the frame by default, 2 mm of 70."""
 _WIDE_DEG = 12.0
 """SD of the orientations about an axis that is enough to determine the transform well."""
 
@@ -106,6 +109,8 @@ class Guide:
     """The first of the images, up to the newest, that are the same to the last pixel."""
     _stuck: float = -np.inf
     """Time of the newest image that is the same as one of another place."""
+    _contradicted: Float[np.ndarray, "4 4"] | None = None
+    """A still pose during which the target moved in the image: wrong until the pose changes."""
     _tried: float = -np.inf
     _words: str = ""
 
@@ -129,6 +134,7 @@ class Guide:
             moment.popleft()
         poses = np.array([each.pose for each in moment])
         if not self._still(poses):
+            self._contradicted = None
             # Keep only the newest poses: the probe may be still from now on.
             while len(moment) > 1 and moment[-1].time - moment[0].time > 0.3 * rules.hold_s:
                 moment.popleft()
@@ -138,7 +144,7 @@ class Guide:
         if posed.time - self._tried < 0.5 * rules.hold_s:
             return Look(self._words)
         self._tried = posed.time
-        look = self._judge(moment[len(moment) // 2], mean_pose(poses))
+        look = self._judge(mean_pose(poses))
         self._words = look.words
         return look
 
@@ -152,8 +158,10 @@ class Guide:
         self._moment.clear()
         self._tried, self._words, self._stuck = -np.inf, "", -np.inf
 
-    def _judge(self, middle: PosedImage, pose: Float[np.ndarray, "4 4"]) -> Look:
-        rules, frame = self.rules, middle.image.array
+    def _judge(self, pose: Float[np.ndarray, "4 4"]) -> Look:
+        """Judge the moment by its middle image; the poses, of this mean, are still."""
+        rules, middle = self.rules, self._moment[len(self._moment) // 2]
+        frame = middle.image.array
         located = localise(frame, rules.target, region=rules.region)
         if not located.found[0]:
             return Look(f"no credible target: {located.reason[0]}")
@@ -175,8 +183,25 @@ class Guide:
                     "image: is the tracker frozen, or was the target moved?",
                     pixel=where,
                 )
+        if self._moves(pixel, frame.shape):
+            self._contradicted = pose
+        if self._contradicted is not None and self._still(np.array([self._contradicted, pose])):
+            return Look(
+                "the target moves in the image while the pose is still: is the tracker frozen?",
+                pixel=where,
+            )
         taken = Taken(pose, pixel, located.covariance[0], middle.time, middle)
         return Look(f"taken: {len(self.taken) + 1}", taken, where)
+
+    def _moves(self, pixel: np.ndarray, shape: tuple[int, ...]) -> bool:
+        """Whether the target is elsewhere at the moment's beginning or end than in its middle."""
+        for end in (self._moment[0], self._moment[-1]):
+            located = localise(end.image.array, self.rules.target, region=self.rules.region)
+            moved = np.abs(located.position[0] - pixel) / [shape[1], shape[0]]
+            # A frame without a target tells nothing: the comparison with NaN is false.
+            if np.max(moved) > _AT_REST * self.rules.different_part:
+                return True
+        return False
 
     def _still(self, poses: Float[np.ndarray, "n 4 4"]) -> bool:
         shift, turn = spread_of(poses)

@@ -9,8 +9,10 @@ or sent damaged frames) the acquisition goes on once the device is well again
 
 from __future__ import annotations
 
+import math
 import threading
 import time
+import zlib
 from collections import deque
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
@@ -23,6 +25,7 @@ from hw.active_echo.device import SILENT, ActiveEcho, EchoFrame, median_of
 from hw.recording.recorder import Recorder
 from hw.robot.stream import PoseSample, PoseStream
 from hw.runtime.errors import DeviceError, StaleError
+from hw.runtime.rigid import apart
 from hw.setup.description import Setup
 from hw.ultrasound.receiver import Image, UltrasoundStream
 from jaxcal import CalibrationError
@@ -32,6 +35,8 @@ _PERIOD_WALL_S = 0.005
 # Rows are written in batches: a write costs a millisecond, however many rows it has.
 _BATCH_WALL_S = 0.25
 _KEPT_FRAMES = 256
+_MOVED_MM = 0.3
+"""An arm whose pose changes by more is not at rest; a degree counts as a mm."""
 DELAY_S = 10.0
 """After so many bench seconds the delay of the echo frames is measured again."""
 _LEAST_STAMPS, _MOST_STAMPS = 20, 20_000
@@ -95,6 +100,11 @@ class Session:
         self._changed = threading.Condition()
         self._echo_frames: deque[EchoFrame] = deque(maxlen=_KEPT_FRAMES)
         self._image: Image | None = None
+        self._first_seen: dict[int, float] = {}
+        """When each of the newest different images came first, by the CRC-32 of its pixels."""
+        self._rest: PoseSample | None = None
+        """The pose that the arm left last, or rests at."""
+        self._moved_s = -math.inf
         self._shown: tuple[str, bool] | None = None
         """Device of the images, and whether they are RF channel data."""
         self._failure: Exception | None = None
@@ -312,6 +322,12 @@ class Session:
         what = what if late > self.watch.image_age_s else "no B-mode frame came in time"
         raise StaleError(what, device="ultrasound")
 
+    def is_of_the_way(self, image: Image) -> bool:
+        """Whether the same image, to the last pixel, came before the arm came to rest."""
+        with self._changed:
+            first = self._first_seen.get(zlib.crc32(image.array.tobytes()), image.t_host)
+            return first <= self._moved_s
+
     def record_image(self) -> None:
         """Put the newest ultrasound frame into the recording, unless every frame goes there."""
         image = self.latest_image()
@@ -347,8 +363,17 @@ class Session:
             if frames:
                 self._echo_frames.extend(frames)
                 self._echo_seen = frames[-1].t_host
-            if images:
-                self._image, self._image_seen = images[-1], images[-1].t_host
+            for image in images:
+                self._image, self._image_seen = image, image.t_host
+                digest = zlib.crc32(image.array.tobytes())
+                # Those that come again are kept longest.
+                first = self._first_seen.pop(digest, image.t_host)
+                self._first_seen[digest] = first
+                if len(self._first_seen) > _KEPT_FRAMES:
+                    del self._first_seen[next(iter(self._first_seen))]
+            if poses and (self._rest is None or apart(self._rest.pose, poses[-1].pose) > _MOVED_MM):
+                self._moved_s = -math.inf if self._rest is None else poses[-1].t_host
+                self._rest = poses[-1]
             self._changed.notify_all()
         hz = self._clock_hz
         self._stamp("robot", [(pose.t_device, pose.t_host) for pose in poses[-1:]])

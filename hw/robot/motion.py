@@ -26,6 +26,7 @@ import contextlib
 import json
 import math
 import queue
+import signal
 import subprocess
 import sys
 import threading
@@ -55,6 +56,10 @@ _START_PATIENCE_S, _START_TICK_S = 30.0, 0.1
 # The controller's watchdog has stopped the robot long before; a busy machine gets time to answer.
 _HANGS_WALL_S = 2.0
 _HELD_UP_WALL_S = 0.5
+_NO_ANSWER = (
+    "the controller does not answer, its own watchdog stops the robot. Motion needs a new "
+    "confirmation"
+)
 _SUSPENDED_WALL_S = 10.0
 """After a longer suspension somebody may stand at the robot: it must not go on by itself."""
 
@@ -241,6 +246,7 @@ class Motion:
         tick = max(0.001, self.clock.wall(_TICK_S))
         hesitation: StaleError | None = None
         stopping: DeviceError | None = None
+        silence: LostError | None = None
         while True:
             asked_s = time.monotonic()
             try:
@@ -269,6 +275,8 @@ class Motion:
                         raise error if hesitation is None else hesitation
                 case "stopping":
                     stopping = error
+                case "hung":
+                    silence = LostError("the controller's answers are lost", device="robot")
             # Asked also while the robot brakes for a hesitation: it may tell of a danger now.
             told_now = self._ask_guard()
             hesitation = hesitation or told_now
@@ -279,18 +287,12 @@ class Motion:
             self._send({"request": "heard"})
             silent = time.monotonic() - self._heard
             if silent > _HANGS_WALL_S + self.clock.wall(0.5):
-                error = (
-                    self._stop
-                    or stopping
-                    or LostError("the motion process does not respond", device="robot")
-                )
+                silence = LostError("the motion process does not respond", device="robot")
+            if silence is not None:
+                error = self._stop or stopping or silence
                 self._in_motion = False
                 self._kill(error)
-                raise type(error)(
-                    f"{error.args[0]}; the controller does not answer, its own watchdog stops the "
-                    "robot. Motion needs a new confirmation",
-                    device="robot",
-                )
+                raise type(error)(f"{error.args[0]}; {_NO_ANSWER}", device="robot")
 
     def _ask_guard(self) -> StaleError | None:
         """Ask the guard; a danger is latched and sent, a hesitation is returned."""
@@ -388,8 +390,10 @@ class Motion:
                     self._heard = self._told = time.monotonic()
                     self._hear(json.loads(line))
         finally:
-            text = "the motion process ended; the robot's own watchdog stops it"
-            self._answers.put({"what": "error", "kind": "LostError", "text": text, "ended": True})
+            what, text = "error", "the motion process ended; the robot's own watchdog stops it"
+            if self._process.wait() == -signal.SIGALRM:
+                what, text = "hung", _NO_ANSWER
+            self._answers.put({"what": what, "kind": "LostError", "text": text, "ended": True})
 
     def _note(self, t: float, command: str, values: dict[str, object]) -> None:
         try:

@@ -62,6 +62,11 @@ def turn_deg(first: Float[np.ndarray, "4 4"], second: Float[np.ndarray, "4 4"]) 
     return float(np.degrees(rotation_angle(first, second)))
 
 
+def apart(first: Float[np.ndarray, "4 4"], second: Float[np.ndarray, "4 4"]) -> float:
+    """Distance of two poses, mm; a degree counts as a mm."""
+    return float(np.linalg.norm(first[:3, 3] - second[:3, 3])) + turn_deg(first, second)
+
+
 def looking_rotation(looking: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
     """Image axes [lateral, elevational, axial] in the base frame of a probe with this direction."""
     axial = np.asarray(looking, float) / np.linalg.norm(looking)

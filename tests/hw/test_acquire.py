@@ -49,7 +49,7 @@ from hw.robot.confirmation import confirm_unattended
 from hw.robot.motion import Motion
 from hw.robot.motion_plan import MotionPlan
 from hw.robot.path_checks import check_plan
-from hw.runtime.errors import RefusedError
+from hw.runtime.errors import LostError, RefusedError
 from hw.runtime.keys import Pause
 from hw.setup.check import check
 from hw.setup.description import Setup
@@ -520,6 +520,27 @@ def test_what_ends_a_run_is_recorded_whatever_it_is(e_series, tmp_path):
     with h5py.File(path) as file:
         assert file["events/kind"][-1] == b"stopped"
         assert file["events/text"][-1] == b"BrokenPipeError: [Errno 32] Broken pipe"
+
+
+def test_an_interrupt_while_the_end_is_noted_does_not_hide_it(e_series, tmp_path):
+    """As when a system ends all processes: the mover's end is told, then comes the signal."""
+    path = tmp_path / "rec.h5"
+
+    class Lost(LostError):
+        def __str__(self) -> str:
+            signal.raise_signal(signal.SIGINT)
+            return super().__str__()
+
+    def say(line: str) -> None:
+        if line.startswith("confirmed: "):
+            raise Lost("gone", device="robot")
+
+    request = AcquisitionRequest(4, "none", 1, bench=3)
+    with pytest.raises(AcquisitionStopped, match="interrupted; 0 of 4"):
+        run(e_series, path, request, say, setup=quick_setup_of(e_series))
+    with h5py.File(path) as file:
+        assert file["events/kind"][-1] == b"stopped"
+        assert file["events/text"][-1] == b"interrupted"
 
 
 @pytest.mark.slow

@@ -457,6 +457,20 @@ def test_a_tracker_that_is_frozen_has_no_image_taken():
     assert any(each.startswith(frozen) for each in words)
 
 
+@pytest.mark.parametrize("since", [0.0, 0.6])
+def test_a_tracker_that_freezes_on_the_way_has_no_image_taken(since):
+    """It repeats a pose of which there is no image yet; the hand goes on and then rests."""
+    rng = np.random.default_rng(0)
+    (pose, *_), (start, end, _) = holds(3, 1)
+    guide = Guide()
+    words = []
+    for number in range(40):
+        part = min(since + 0.05 * number, 1.0)
+        pixel = np.asarray(start) + part * (np.asarray(end) - start)
+        words.append(guide.look(still(pose, 0.05 * number, frame(rng, tuple(pixel)))).words)
+    assert words[-1].startswith("the target moves in the image while the pose is still")
+
+
 def test_advice_names_what_is_missing():
     rng = np.random.default_rng(0)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import queue
+import re
 import signal
 import subprocess
 import sys
@@ -101,9 +102,9 @@ def put_in_order(robot: EmulatedRobot) -> None:
     robot.ask("force", [0.0] * 6)
 
 
-def kill_mover(motion: Motion) -> None:
+def signal_mover(motion: Motion, number: signal.Signals) -> None:
     assert motion._process is not None
-    os.kill(motion._process.pid, signal.SIGKILL)
+    os.kill(motion._process.pid, number)
 
 
 FAULTS = [
@@ -115,6 +116,7 @@ FAULTS = [
     ("kill", BOTH, LostError, "motion process ended", True),
     ("silent", BOTH, StaleError, "the caller was silent", False),
     # The same stop for another reason.
+    ("end", ["CB"], StoppedError, r"process was asked to end \(SIGTERM\)", True),
     ("hesitation", ["CB"], StaleError, "no frame for 0.2 s", False),
     ("protective_stop", ["CB"], StoppedError, "protective stop: find its cause", True),
     ("off", ["CB"], StoppedError, "powered off: switch the robot on and release", True),
@@ -156,7 +158,8 @@ def check_fault(robot: EmulatedRobot, name: str, kind: type, text: str, ends: bo
             ),
             "silent": lambda: reasons.__setitem__(0, "silent"),
             "stop": lambda: motion.stop("the operator pressed stop"),
-            "kill": lambda: kill_mover(motion),
+            "kill": lambda: signal_mover(motion, signal.SIGKILL),
+            "end": lambda: signal_mover(motion, signal.SIGTERM),
             "force": lambda: robot.ask("force", [0.0, 0.0, -40.0, 0.0, 0.0, 0.0]),
             "tcp_offset": lambda: robot.ask(name, [0.0, 0.0, 0.2, 0.0, 0.0, 0.0]),
             "off": lambda: robot.ask("robot_state", 3, 1),
@@ -172,6 +175,9 @@ def check_fault(robot: EmulatedRobot, name: str, kind: type, text: str, ends: bo
             raise error
         assert rest_s <= STOP_WITHIN_S
         assert told_s < 5.0
+        if name == "end":
+            # In order, not by the controller's watchdog.
+            assert robot.state()["reason"] == "the client stopped the script"
         reasons[0] = None
         moves = len(sent(robot, 3))
         if ends:
@@ -212,6 +218,22 @@ def test_lost_answers_end_motion_though_poses_come(robots):
         assert told_s < 1.5
 
 
+def test_answers_lost_while_a_command_waits_are_told_as_soon(robots):
+    """The command holds the interpreter's lock of the process that sent it for seconds."""
+    robot = robots["e"]
+    put_in_order(robot)
+    with moving(robot, caller_s=2.0) as motion:
+        target = farther(robot)
+        robot.ask("mute control", True)
+        moves, before = len(sent(robot, 3)), robot.clock.now()
+        with pytest.raises(LostError, match=r"answers are lost; .* needs a new confirmation"):
+            motion.move_to(target)
+        assert robot.clock.now() - before < 1.5
+        with pytest.raises(RefusedError, match="confirm the plan again"):
+            motion.move_to(target)
+        assert len(sent(robot, 3)) == moves
+
+
 @pytest.mark.parametrize("dashboard", [None, ""], ids=["answers", "mute"])
 def test_a_motion_does_not_go_on_when_a_safeguard_stop_is_released(robots, dashboard):
     """Such a stop only pauses the program, and may be released by closing a gate."""
@@ -234,6 +256,27 @@ def test_a_motion_does_not_go_on_when_a_safeguard_stop_is_released(robots, dashb
             assert robot.state()["raw"] == stood
         with pytest.raises(RefusedError, match="confirm the plan again"):
             motion.move_to(HOME)
+
+
+def test_of_two_that_connect_at_once_one_moves_the_robot(robots):
+    robot = robots["e"]
+    put_in_order(robot)
+    moves = len(sent(robot, 3))
+    target = farther(robot)
+
+    def move() -> str:
+        try:
+            with moving(robot, caller_s=2.0) as motion:
+                motion.move_to(target)
+                return "arrived"
+        except DeviceError as error:
+            return str(error)
+
+    with ThreadPoolExecutor(2) as pool:
+        told = sorted(pool.map(lambda _: move(), range(2)))
+    assert told[0] == "arrived"
+    assert re.search("another program commands this robot|a program runs on the robot", told[1])
+    assert len(sent(robot, 3)) == moves + 1
 
 
 TAKEN_OVER = {

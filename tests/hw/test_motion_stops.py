@@ -34,7 +34,7 @@ from hw.robot.confirmation import confirm_unattended
 from hw.robot.identity import read_identity
 from hw.robot.motion import Motion
 from hw.robot.motion_plan import MotionPlan
-from hw.runtime.errors import RefusedError, StaleError, StoppedError
+from hw.runtime.errors import LostError, RefusedError, StaleError, StoppedError
 from hw.runtime.interrupts import as_interrupts
 from jaxcal.runtime.isolated import import_path
 
@@ -84,7 +84,7 @@ def test_a_guard_that_fails_stops_the_robot():
 
 @pytest.mark.parametrize("times", [1, 2])
 def test_interrupts_while_connecting_leave_no_program_on_the_robot(times):
-    """Our program has no watchdog yet: left there, only a person at the pendant could end it."""
+    """It is ended in order, not by its watchdog 2 s later."""
     with EmulatedRobot(version=CB_SERIES) as robot:
         plan = replace(PLAN, serial=read_identity(robot.host).name)
         given = confirm_unattended(plan, plan.digest, clock=robot.clock)
@@ -111,6 +111,29 @@ def test_interrupts_while_connecting_leave_no_program_on_the_robot(times):
         motion._process.wait(5.0)
         assert not robot.state()["running"]
         motion.close()
+
+
+def test_a_mover_killed_before_its_first_command_leaves_no_program_on_the_robot():
+    """The program itself ends when it hears nothing: nobody is left who could set a watchdog."""
+    with EmulatedRobot(version=CB_SERIES, speed=4.0) as robot, ThreadPoolExecutor(1) as pool:
+        plan = replace(PLAN, serial=read_identity(robot.host).name)
+        while not robot.state()["loading"]:
+            given = confirm_unattended(plan, plan.digest, clock=robot.clock)
+            motion = Motion(robot.host, plan, given, clock=robot.clock, dry_run=False)
+            starting = pool.submit(motion.start)
+            while not robot.state()["loading"] and not starting.done():
+                pass
+            assert motion._process is not None
+            # A busy machine may be too late, and another try is needed.
+            os.kill(motion._process.pid, signal.SIGKILL)
+        assert isinstance(starting.exception(5.0), LostError)
+        while not robot.state()["running"]:
+            time.sleep(0.001)
+        deadline = time.monotonic() + 10.0
+        while (state := robot.state())["running"] and time.monotonic() < deadline:
+            time.sleep(0.02)
+        assert state["log"] == []
+        assert state["reason"].startswith("watchdog: nothing written for 2.0")
 
 
 _CALLER = """

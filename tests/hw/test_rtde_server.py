@@ -13,7 +13,7 @@ import pytest
 from robots import CB_SERIES, E_SERIES, START, EmulatedRobot, address
 
 from hw.bench.arm import Arm
-from hw.bench.controller import DONE, READY, Controller
+from hw.bench.controller import DONE, READY, Controller, before_loop
 from hw.bench.robot import RobotProcess
 from hw.bench.rtde import RtdeServer
 from hw.bench.rtde_fields import output_type
@@ -151,6 +151,42 @@ def test_the_program_s_handshake():
     program.step(2.2)
     assert not program.running
     assert program.reason == "movePath (command 45) is not emulated"
+
+
+SCRIPT = """def rtde_control():
+    # rtde_set_watchdog("input_int_register_0", 1.0, "stop")
+    def inside():
+        rtde_set_watchdog("input_int_register_0", 9.0, "stop")
+    end
+    rtde_set_watchdog({})
+    while True:
+        rtde_set_watchdog("input_int_register_0", 9.0, "stop")
+    end
+end
+"""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        ('"input_int_register_0", 0.5, "stop"', "watchdog: nothing written for"),
+        ('"input_int_register_0", 0.5, "pause"', "is not emulated"),
+        ('"no_register", 0.5, "stop"', "is not emulated"),
+    ],
+)
+def test_a_script_that_watches_itself_ends_when_it_hears_nothing(arguments, reason):
+    program = Controller(Arm(START))
+    first = before_loop(SCRIPT.replace("{}", arguments))
+    assert first == [f"rtde_set_watchdog({arguments})"]
+    assert before_loop(SCRIPT.removesuffix("end\n")) is None
+    program.upload(0.0, first)
+    program.step(0.06)
+    assert program.running == (reason != "is not emulated")
+    program.step(2.0)
+    program.kick(2.0)
+    program.step(4.05)
+    assert not program.running
+    assert reason in program.reason
 
 
 @pytest.mark.parametrize("where", ["waiting", "working"])

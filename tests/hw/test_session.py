@@ -12,17 +12,21 @@ import numpy as np
 import pytest
 from motions import PLAN, moving
 from robots import CB_SERIES, EmulatedRobot
+from test_world import placed
 
 from hw.acquisition.stage import ProbeStage
 from hw.active_echo.device import ActiveEcho
 from hw.bench.active_echo import AuspisEmulator
+from hw.bench.frames import Camera
+from hw.bench.tank import Look
 from hw.bench.ultrasound import ImageServer
+from hw.bench.world import make_world
 from hw.planning.scene import Scene
 from hw.recording.layout import RecordingHeader
 from hw.recording.recorder import Recorder
 from hw.recording.session import Session, frame_period
 from hw.runtime.clock import Clock
-from hw.runtime.errors import RefusedError
+from hw.runtime.errors import RefusedError, StaleError
 from hw.setup.description import Setup
 from jaxcal.data.probe import LinearProbe
 
@@ -96,6 +100,47 @@ def test_an_image_that_a_slow_link_holds_up_is_not_of_the_next_pose(tmp_path):
             image = session.image_after(arrived)
     assert image.t_device - 1_000_000.0 > arrived - 0.2
     assert image.late_s == pytest.approx(robot.clock.speed * 0.7, abs=0.2)
+
+
+@pytest.mark.parametrize("moment", ["on the way", "never"])
+def test_a_frame_of_before_the_probe_came_to_rest_is_not_measured(tmp_path, moment):
+    """A frozen machine whose screen is grabbed sends it again and again, with new time stamps."""
+    pytest.importorskip("rtde_control", reason="ur_rtde has no wheel for this platform")
+    world = make_world(0, phantom="cross-wire", response_mm=0.0)
+    camera = Camera(world, Look(speckle_db=90.0, ghost=0.0))
+    view = camera.frame(placed(world, 3.0, 0.0, 45.0), np.random.default_rng(0))
+    start, end = PLAN.targets[0][0, 3], PLAN.targets[2][0, 3]
+    frozen_at = {"on the way": (start + end) / 2, "never": np.inf}[moment]
+    point = (PLAN.targets[2] @ [3.0, 0.0, 45.0, 1.0])[:3]
+    scene = Scene(np.eye(4), point, np.array([0.0, 0.0, -1.0]))
+    with (
+        EmulatedRobot(version=CB_SERIES, speed=3.0) as robot,
+        AuspisEmulator(silence, clock=robot.clock, lines=8) as emulator,
+        Recorder(tmp_path / "r.h5", RecordingHeader("pixel", {}, 8, settings="{}")) as recorder,
+    ):
+
+        def seen(t: float) -> np.ndarray:
+            # A number in the corner: no two places of the arm look the same.
+            x = min(1000.0 * robot.arm.raw(t)[0], frozen_at)
+            frame = view.copy()
+            frame[:8, :8] = np.frombuffer(np.float64(round(x, 3)).tobytes(), np.uint8)
+            return frame
+
+        with ImageServer(seen, clock=robot.clock, spacing_mm=camera.spacing_mm) as machine:
+            setup = Setup(
+                robot.host, emulator.path, scene, {}, (machine.host, machine.port),
+                probe=LinearProbe(elements=8), clock=robot.clock,
+            )  # fmt: skip
+            with Session(setup, recorder) as session, moving(robot, caller_s=2.0) as motion:
+                session.image_after(robot.clock.now())
+                stage = ProbeStage(session, motion, PLAN.targets, lambda kind, text: None)
+                stage.go_to(2)
+                if moment == "never":
+                    place, _ = stage.locate(2)
+                    np.testing.assert_allclose(place, [3.0, 45.0], atol=0.3)
+                    return
+                with pytest.raises(StaleError, match="before the probe came to rest"):
+                    stage.locate(2)
 
 
 def test_images_of_a_machine_that_also_sends_rf(tmp_path):

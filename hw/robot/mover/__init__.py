@@ -11,6 +11,7 @@ robot is stopped.
   stop, which stays until the robot rests, or for good.
 - ``controller``: the only commands to the robot, the watchdog's kicks, and braking.
 - ``connection``: opening and ending the connection to the controller.
+- ``program``: what runs on the controller meanwhile, and its own watchdog.
 - ``monitor``: what must stop the robot.
 - ``control_loop``: requests become motions, one after the other; its states.
 - ``__main__``: the process.

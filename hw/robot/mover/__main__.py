@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import signal
+from types import FrameType
 from typing import NoReturn
 
 from hw.robot.gate import Gate
@@ -12,6 +14,7 @@ from hw.robot.mover.controller import Controller
 from hw.robot.mover.inputs import Ended, Inputs, Stop
 from hw.robot.mover.messages import Caller, Setup, told
 from hw.runtime.errors import DeviceError, LostError, StoppedError
+from hw.runtime.interrupts import ENDING
 from hw.runtime.processes import ASKS, be_prompt
 
 
@@ -40,6 +43,14 @@ def _serve(setup: Setup, caller: Caller) -> NoReturn:
     To return would call its destructor, which takes half a second.
     """
     inputs = Inputs(caller, setup.clock)
+
+    def end(number: int, frame: FrameType | None) -> None:
+        text = f"the motion process was asked to end ({signal.Signals(number).name})"
+        inputs.latch.set(Stop(StoppedError(text, device="robot"), True))
+
+    # A system that is shut down sends them to all processes: the robot is stopped in order.
+    for number in ENDING:
+        signal.signal(number, end)
     gate = Gate(setup.plan, setup.confirmation, setup.clock)
     controller = Controller(setup, inputs, caller)
     connection = Connection(setup, gate, inputs, controller)

@@ -15,6 +15,7 @@ from hw.robot.mover.controller import IDLE_WATCHDOG_HZ, STOP_PATIENCE_S, Control
 from hw.robot.mover.inputs import Inputs
 from hw.robot.mover.messages import Setup
 from hw.robot.mover.no_reconnect import NoReconnect
+from hw.robot.mover.program import guarded_program, send_program
 from hw.robot.path_checks import check_plan
 from hw.robot.rtde import PORT, PROGRAM_RUNS, PacketReader, safety_text, state_text, too_late
 from hw.runtime.clock import Lag
@@ -65,27 +66,32 @@ class Connection:
         self._gate.check_start(identity.name, offset, inputs.pendant)
         self._check_state(identity.remote)
         module = require("rtde_control", extra="robot")
-        before = set(os.listdir("/proc/self/fd"))
-        self._no_reconnect = NoReconnect(setup.host)
         controller.log("connect", host=setup.host, serial=identity.name)
         try:
             # A silent controller would hold this for ever, and the caller may be gone.
             _end_within(_START_S)
+            program = guarded_program(module, setup.host, IDLE_WATCHDOG_HZ)
+            self._no_reconnect = NoReconnect(setup.host)
+            before = set(os.listdir("/proc/self/fd"))
             # The thread that ur_rtde starts inherits this priority.
             be_prompt(RECEIVES)
-            controller.rtde_control = module.RTDEControlInterface(setup.host)
+            flags = module.RTDEControlInterface.FLAG_CUSTOM_SCRIPT
+            flags |= module.RTDEControlInterface.FLAG_NO_WAIT
+            rtde_control = module.RTDEControlInterface(setup.host, -1.0, flags)
         except RuntimeError as error:
             raise LostError(said(error), device="robot") from None
         finally:
             be_prompt(ASKS)
-        _end_within(0.0)
         controller.answers = _connection_among(set(os.listdir("/proc/self/fd")) - before)
         self._no_reconnect.begin()
+        with send_program(self._no_reconnect.connect, setup.host, program):
+            self._wait_for_packet(running=True)
+        _end_within(0.0)
+        controller.rtde_control = rtde_control
         controller.watch_rest()
         if inputs.tcp_offset is None:
             inputs.tcp_offset = numbers(controller.command("getTCPOffset"), 6, "TCP offset")
         self._gate.check_authority(identity.name, inputs.tcp_offset, inputs.pendant)
-        self._wait_for_packet(running=True)
         inputs.program_started = True
         # What they tell of was before our program.
         inputs.unseen()
@@ -107,7 +113,6 @@ class Connection:
         give_up = self._clock.now() + 2.0 + self._clock.speed
         while self._clock.now() < give_up:
             self._inputs.read(self._clock.wall(0.01))
-            self._controller.kick()
             if self._inputs.connected and (
                 not running or self._inputs.packet.status_bits & PROGRAM_RUNS
             ):
@@ -152,10 +157,7 @@ class Connection:
     def end_script(self) -> None:
         """End our program; the robot must rest."""
         self._controller.log("kickWatchdog", times=self._controller.kicks)
-        # Calls to a controller that is gone may hang, and nobody kills this process if the caller
-        # is gone, too. The robot rests by now.
-        _end_within(_END_S)
-        self._controller.command("stopScript")
+        self._controller.command("stopScript", within_s=_END_S)
 
     def end_paused(self) -> str:
         """End a program that a safety stop has paused: it might go on when the stop is released.

@@ -4,8 +4,9 @@ How ur_rtde behaves, and what is done about it (each measured):
 
 - A getter of a lost connection returns the last values, so freshness comes from
   :class:`hw.robot.rtde.PacketReader`.
-- Calls to a silent controller hang, so the caller kills this process after a while, and the
-  controller's own watchdog stops the robot 0.1 s after the last sign of life.
+- Calls to a silent controller hang and hold the interpreter's lock, so the system ends this
+  process (SIGALRM), and the controller's own watchdog stops the robot 0.1 s after the last sign of
+  life.
 - A connection that was reset is opened again, and the script sent again, without asking; so it is
   kept from that (:mod:`hw.robot.mover.no_reconnect`), and the system is asked about its connection:
   a reset ends the motion for good, and so do lost answers.
@@ -15,6 +16,7 @@ How ur_rtde behaves, and what is done about it (each measured):
 from __future__ import annotations
 
 import math
+import signal
 import socket
 import struct
 from typing import Any
@@ -42,6 +44,8 @@ _TCP_INFO, _ESTABLISHED = struct.Struct("=B51xI"), 1
 _UNHEARD_S = 0.5
 """The controller's answers are lost if none came for so long (wall s), while poses come in time:
 sending a lost packet again takes 0.2 s."""
+_LEAST_WAIT_S = 0.1
+"""A command may wait for its answer at least so long (wall s)."""
 _CAUSE_S = 0.1
 """The poses tell of a safety stop by so much later than the controller's program ends."""
 
@@ -71,15 +75,27 @@ class Controller:
 
     # Commands
 
-    def command(self, name: str, *values: object) -> object:
+    def command(self, name: str, *values: object, within_s: float = _UNHEARD_S) -> object:
         """One command to the controller; every one is logged before it is sent.
+
+        Args:
+            name: of ur_rtde's function.
+            values: its arguments.
+            within_s: the process ends if no answer comes for so long (wall s), counted from what
+                came last; the caller is told why by the signal that ended it.
 
         Raises:
             Ended: the controller's program has stopped, or its answers are lost.
         """
         self.check_answers()
         self.log(name, values=values)
-        return self._call(name, *values)
+        outer_s, _ = signal.getitimer(signal.ITIMER_REAL)
+        wait_s = max(_LEAST_WAIT_S, within_s - self._connection()[1] / 1000)
+        signal.setitimer(signal.ITIMER_REAL, min(wait_s, outer_s or wait_s))
+        try:
+            return self._call(name, *values)
+        finally:
+            signal.setitimer(signal.ITIMER_REAL, outer_s)
 
     def check_answers(self) -> None:
         """Check that ur_rtde hears the controller: its commands wait for answers for seconds.
@@ -231,4 +247,7 @@ def unfit(packet: Packet) -> StoppedError | None:
 
 def said(error: RuntimeError) -> str:
     """An error of ur_rtde; some of its texts begin with its name."""
+    if "registers are already in use" in str(error):
+        # Its own text speaks of fieldbuses alone.
+        return "another program commands this robot, or a fieldbus uses its RTDE input registers"
     return f"ur_rtde: {str(error).removeprefix('ur_rtde: ')}"
