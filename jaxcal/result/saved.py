@@ -25,16 +25,18 @@ FORMAT = "jaxcal-calibration"
 VERSION = 1
 MAXIMUM_BYTES = 64 * 2**20
 
+_IN_THE_PLANE = ("scale_mm_per_px", "face_offset_mm", "range_factor")
+"""What takes an image point to the image plane; no part of the rigid transform."""
+
 _NPZ = (
     "image_plane_to_probe",
-    "scale_mm_per_px",
-    "face_offset_mm",
-    "range_factor",
+    *_IN_THE_PLANE,
     "covariance",
     "image_unknowns",
     "image_covariance",
     "rms_mm",
     "converged",
+    "date",
 )
 _NPZ_BYTES = 65536
 """Largest size of an ``.npz``, also unpacked."""
@@ -126,6 +128,7 @@ def save(
     chosen = check_target(path, format)
     if chosen != "json":
         transform.check_usable()
+    transform = replace(transform, date=transform.date or utc_now())
     if chosen in ("slicer", "itk"):
         from jaxcal.io.itk import write_itk
 
@@ -135,13 +138,12 @@ def save(
             if os.fspath(path).lower().endswith(".npz"):
                 known = {key: value for key, value in _record(transform).items() if key in _NPZ}
                 matrix = None if transform.scale_mm_per_px is None else transform.plus_matrix()
-                known["plus_image_to_probe"] = matrix
+                known |= {"plus_image_to_probe": matrix, "probe_frame": transform.probe_frame}
                 np.savez(file, **{k: v for k, v in known.items() if v is not None})
             else:
                 np.save(file, transform.plus_matrix())
     else:
-        dated = replace(transform, date=transform.date or utc_now())
-        write_text(path, text_of(dated, chosen, frames=frames))
+        write_text(path, text_of(transform, chosen, frames=frames))
 
 
 def text_of(transform: ImageTransform, format: SaveFormat, *, frames: FramePair) -> str:
@@ -168,7 +170,9 @@ def text_of(transform: ImageTransform, format: SaveFormat, *, frames: FramePair)
 
         # ROS's own frames are in lower case; the user's are written as they are.
         child, parent = (n.lower() if n in ("Image", "Probe") else n for n in two_names(frames))
-        return ros_yaml(transform.image_plane_to_probe, parent, child, left_out(transform, format))
+        held = {key: value for key, value in _record(transform).items() if key in _IN_THE_PLANE}
+        note = left_out(transform, format)
+        return ros_yaml(transform.image_plane_to_probe, parent, child, note, held)
     if format == "tusrec":
         from jaxcal.io.tus_rec import calib_matrix
 
@@ -267,7 +271,10 @@ def load_calibration(path: str | os.PathLike[str]) -> ImageTransform:
         if lower.endswith((".yaml", ".yml")):
             from jaxcal.io.ros import read_ros_yaml
 
-            return ImageTransform(read_ros_yaml(path), source=name)
+            matrix, held = read_ros_yaml(path)
+            record = {key: held.get(key) for key in _IN_THE_PLANE}
+            record |= {"version": VERSION, "image_plane_to_probe": matrix}
+            return transform_from_record(record, source=name)
         if lower.endswith(".npy"):
             return transform_from_plus_matrix(_load_npy(path), source=name)
         if lower.endswith(".npz"):
@@ -317,6 +324,8 @@ def _load_npz(path: str | os.PathLike[str]) -> ImageTransform:
                 raise FormatError("holds more than a calibration")
         with np.load(path, allow_pickle=False) as file:
             record = {name: file[name].tolist() for name in _NPZ if name in file.files}
+            if "probe_frame" in file.files:
+                record["pose_frames"] = {"from": file["probe_frame"].tolist()}
     except FormatError:
         raise
     except Exception as error:
