@@ -634,6 +634,24 @@ def test_export_to_standard_output(saved, capsys, name):
     assert capsys.readouterr().out == random_transform().text(name)
 
 
+def test_a_name_that_plus_refuses_is_told(saved, tmp_path, capsys):
+    """NDI ToolBox calls its tools Port 1."""
+    saved.write_text(json.dumps(good_record() | {"pose_frames": {"from": "Port 1", "to": "T"}}))
+    note = "calls the probe's frame 'Port 1', which PLUS refuses: written as Probe"
+    for name, said in (("plus", note), ("ros", note), ("slicer", None)):
+        assert main(["export", str(saved), f"--{name}"]) == 0
+        assert (said or "calls") not in (found := capsys.readouterr()).out
+        assert found.err.count(note) == (said is not None)
+    assert main(["export", str(saved), "--plus", "--probe-frame", "Wand"]) == 0
+    found = capsys.readouterr()
+    assert (found.err, 'To="Wand"' in found.out) == ("", True)
+    load_calibration(saved).save(tmp_path / "again.json")
+    assert load_calibration(tmp_path / "again.json").probe_frame == "Port 1"
+    saved.write_text(json.dumps(good_record() | {"pose_frames": {"from": "Tip-1", "to": "T"}}))
+    assert main(["export", str(saved), "--ros"]) == 2
+    assert "'Tip-1' cannot name a frame in ROS: letters, digits, _ and /" in capsys.readouterr().err
+
+
 def test_export_to_files(saved, tmp_path, capsys):
     for name, out in (("slicer", "a.tfm"), ("itk", "a.h5"), ("numpy", "a.npz"), ("numpy", "a.npy")):
         assert main(["export", str(saved), f"--{name}", str(tmp_path / out)]) == 0

@@ -24,8 +24,8 @@ _TEXTS = {
     "numpy": "PLUS's matrix (OUT.npy), or all that is known (OUT.npz).",
 }
 
-_NAMELESS = ("slicer", "itk", "tusrec", "numpy")
-"""Formats without names of frames."""
+NAMING = ("plus", "ros")
+"""Formats that name the frames."""
 
 
 def _one_format(_: click.Context, __: click.Parameter, given: tuple[str, ...]) -> str | None:
@@ -103,17 +103,19 @@ def export(
         raise click.UsageError("--plus-server writes no file: leave OUT out")
     if origin is not None and pixel_size is None:
         raise click.BadParameter("needs --pixel-size", param_hint="--origin")
-    if (image_frame, probe_frame or "Probe") != ("Image", "Probe") and format in _NAMELESS:
+    named = format is None or format in NAMING
+    if (image_frame, probe_frame or "Probe") != ("Image", "Probe") and not named:
         raise click.UsageError(
             f"--{format} names no frames: leave --image-frame, --probe-frame out"
         )
-    from jaxcal.result.saved import check_target, load_calibration
+    from jaxcal.io.frame_names import probe_name
+    from jaxcal.result.saved import check_target, load_calibration, renamed
 
     if plus_config is None and out is not None:
         format = check_target(out, format, [calibration])
     transform = load_calibration(calibration)
     transform.check_usable()
-    frames = image_frame, probe_frame or transform.probe_frame
+    frames = image_frame, probe_frame or probe_name(transform.probe_frame)
     if plus_config is not None:
         check_configuration(plus_config, out, [calibration], frames)
     if pixel_size is not None:
@@ -128,6 +130,8 @@ def export(
             click.echo(line)
     elif format is not None:
         click.echo(transform.text(format, frames=frames), nl=False)
+    if named and probe_frame is None and (note := renamed(transform)) is not None:
+        click.echo(f"- {note}", err=True)
     return ExitCode.CONVERGED
 
 

@@ -43,7 +43,10 @@ def _digits(value: float) -> str:
 
 def _checked_name(name: str) -> str:
     if not _NAME.fullmatch(name):
-        raise InputError(f"{quoted(name)} cannot name a frame in ROS")
+        raise InputError(
+            f"{quoted(name)} cannot name a frame in ROS: letters, digits, _ and / are needed "
+            "(another name: jaxcal export --probe-frame, --image-frame)"
+        )
     return name
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxcal import FormatError, InputError, __version__
 from jaxcal.io.atomic import atomic_path, write_text
-from jaxcal.io.frame_names import FramePair, check_frames, two_names
+from jaxcal.io.frame_names import FramePair, capitalised, probe_name, two_names
 from jaxcal.io.given_files import check_readable, naming, one_line, path_name, read_bytes
 from jaxcal.io.outputs import check_output
 from jaxcal.model.unknowns import TABLE, tangent_names
@@ -200,6 +200,18 @@ def dated(record: dict[str, Any]) -> dict[str, Any]:
     return record | {"date": utc_now()}
 
 
+def renamed(transform: ImageTransform) -> str | None:
+    """That PLUS refuses the recording's name of the probe's frame, in words; else None."""
+    named = transform.probe_frame
+    written = probe_name(named)
+    if written == capitalised(named):
+        return None
+    return (
+        f"the recording calls the probe's frame {quoted(named)}, which PLUS refuses: written as "
+        f"{written} (another name: jaxcal export --probe-frame)"
+    )
+
+
 def left_out(transform: ImageTransform, format: SaveFormat) -> str | None:
     """What a format cannot hold and its user must do, in words; None where nothing is."""
     if format != "ros":
@@ -257,7 +269,7 @@ def load_calibration(path: str | os.PathLike[str]) -> ImageTransform:
 
             found = read_transform(path)
             made = transform_from_plus_matrix(found.matrix, error_mm=found.error_mm, source=name)
-            return replace(made, probe_frame=probe_frame(found.target))
+            return replace(made, probe_frame=found.target)
         if lower.endswith((".tfm", ".txt", ".h5")):
             from jaxcal.io.itk import read_itk
 
@@ -374,7 +386,8 @@ def transform_from_record(record: dict[str, Any], *, source: str = "memory") -> 
     offset = _array(record, "face_offset_mm", ())
     factor = _array(record, "range_factor", ())
     error = _array(record, "rms_mm", ())
-    date, named = record.get("date"), record.get("pose_frames")
+    date, frames = record.get("date"), record.get("pose_frames")
+    named = frames.get("from") if isinstance(frames, dict) else None
     if not (date is None or isinstance(date, str)):
         raise FormatError("date must be text")
     usable = usable and not record.get("wrong_frames")
@@ -392,16 +405,8 @@ def transform_from_record(record: dict[str, Any], *, source: str = "memory") -> 
         unknowns,
         _array(record, "image_covariance", (size, size)),
         date,
-        probe_frame(named.get("from") if isinstance(named, dict) else None),
+        named if isinstance(named, str) else "Probe",
     )
-
-
-def probe_frame(named: object) -> str:
-    """A name of the probe's frame as it is used; Probe if it is none, or one that PLUS refuses."""
-    try:
-        return check_frames(("Image", named))[1] if isinstance(named, str) else "Probe"
-    except InputError:
-        return "Probe"
 
 
 def _unknowns(record: dict[str, Any]) -> tuple[str, ...]:
