@@ -302,16 +302,30 @@ def stated_points(path: str | os.PathLike[str]) -> np.ndarray | None:
     Raises:
         FormatError: a ``.json`` that is no JSON object.
     """
-    if not path_name(path).lower().endswith(".json"):
-        return None
-    with naming(path):
-        stated = _json_object(path).get("tre")
+    stated = _stated(path, "tre")
     try:
         points = np.array([each["image"] for each in stated["points"]], dtype=np.float64)  # pyright: ignore[reportOptionalSubscript]
     except (TypeError, KeyError, ValueError, OverflowError):
         return None
     sound = points.ndim == 2 and points.shape[1] == 2 and np.isfinite(points).all()
     return points if sound else None
+
+
+def stated_source(path: str | os.PathLike[str]) -> str | None:
+    """The recording that a JSON of ours says it was made from; None if it does not.
+
+    Raises:
+        FormatError: a ``.json`` that is no JSON object.
+    """
+    stated = _stated(path, "source")
+    return stated if isinstance(stated, str) else None
+
+
+def _stated(path: str | os.PathLike[str], key: str) -> Any:
+    if not path_name(path).lower().endswith(".json"):
+        return None
+    with naming(path):
+        return _json_object(path).get(key)
 
 
 def _load_npy(path: str | os.PathLike[str]) -> np.ndarray:
