@@ -634,6 +634,17 @@ def test_export_to_standard_output(saved, capsys, name):
     assert capsys.readouterr().out == random_transform().text(name)
 
 
+def test_the_ending_names_the_format(saved, tmp_path, capsys):
+    for ending in ("xml", "tfm", "yaml", "csv", "npy", "npz"):
+        out = tmp_path / f"a.{ending}"
+        assert main(["export", str(saved), str(out)]) == 0
+        np.testing.assert_allclose(
+            load_calibration(out).plus_matrix(), random_transform().plus_matrix(), atol=1e-12
+        )
+    assert main(["export", str(saved), str(tmp_path / "a.doc")]) == 2
+    assert "its extension names no format" in capsys.readouterr().err
+
+
 def test_a_name_that_plus_refuses_is_told(saved, tmp_path, capsys):
     """NDI ToolBox calls its tools Port 1."""
     saved.write_text(json.dumps(good_record() | {"pose_frames": {"from": "Port 1", "to": "T"}}))

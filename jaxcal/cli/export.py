@@ -91,12 +91,20 @@ def export(
 ) -> int:
     """Write the calibration CAL for another program, to OUT or to standard output.
 
+    The ending of OUT names the format if no option does (.xml, .tfm, .yaml, .csv, .npz, ...).
+
     CAL is the JSON of "jaxcal calibrate", or another program's calibration (a configuration or fCal
     result of PLUS, an ITK transform, calib_matrix.csv, a YAML of easy_handeye). PLUS's and Slicer's
     ImageToProbe takes pixels (u, v, 0, 1) to the probe in mm; ROS gets the rigid transform from the
     image plane in metres.
     """
-    if sum(chosen is not None for chosen in (format, plus_config, plus_server)) != 1:
+    from jaxcal.io.frame_names import probe_name
+    from jaxcal.result.saved import check_target, load_calibration, renamed
+
+    asked = sum(chosen is not None for chosen in (format, plus_config, plus_server))
+    if asked == 0 and out is not None:
+        format, asked = check_target(out, None, [calibration]), 1
+    if asked != 1:
         names = ", ".join(f"--{name}" for name in (*_TEXTS, "plus-config"))
         raise click.UsageError(f"name one format: {names} or --plus-server")
     if plus_server is not None and out is not None:
@@ -108,9 +116,6 @@ def export(
         raise click.UsageError(
             f"--{format} names no frames: leave --image-frame, --probe-frame out"
         )
-    from jaxcal.io.frame_names import probe_name
-    from jaxcal.result.saved import check_target, load_calibration, renamed
-
     if plus_config is None and out is not None:
         format = check_target(out, format, [calibration])
     transform = load_calibration(calibration)
