@@ -213,9 +213,10 @@ def test_what_two_calibrations_should_share_and_do_not_is_told(files, tmp_path, 
     changed = record | {"scale_mm_per_px": [0.05, 0.12], "source": "rec.h5", "pose_frames": frames}
     Path(other).write_text(json.dumps(changed))
     said = told(capsys, files[1], other)
-    assert "A pixel is 0.1000 x 0.1200 mm by the first and 0.0500 x 0.1200 mm by the second" in said
+    assert "A pixel is 0.1000 x 0.1200 mm in the first and 0.0500 x 0.1200 mm in the second" in said
     assert "made from 'rec.h5'. If that is one recording, they share its errors" in said
     assert "different names" not in said
     Path(files[0]).write_text(json.dumps(record | {"pose_frames": {"from": "Wand", "to": None}}))
-    assert "have different names: 'Wand' and 'Port 1'" in told(capsys, files[0], other)
+    said = told(capsys, files[0], other)
+    assert "have different names: 'Wand' in the first, 'Port 1' in the second." in said
     assert "one depth" not in told(capsys, *files[:2])

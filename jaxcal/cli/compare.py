@@ -11,10 +11,11 @@ import click
 from jaxcal.cli.common import ExitCode, json_option, print_json, print_page
 
 if TYPE_CHECKING:
+    import numpy as np
     from rich.table import Table
 
     from jaxcal.diagnostics.comparison import Comparison
-    from jaxcal.result.transform import ImageTransform
+    from jaxcal.runtime.array_types import Float
 
 MOST_FILES = 100
 """Most calibrations that are compared at once, each with each."""
@@ -83,7 +84,10 @@ def compare(
         print_json({"pairs": [_record(*pair) for pair in pairs]})
     elif len(pairs) == 1:
         unit = "mm" if transforms[0].scale_mm_per_px is None else "px"
-        words = [_sentence(pairs[0][2]), *_what_differs(*transforms)]
+        names, sizes = zip(
+            *((each.probe_frame, each.scale_mm_per_px) for each in transforms), strict=True
+        )
+        words = [_sentence(pairs[0][2]), *what_differs(names, sizes, ("the first", "the second"))]
         print_page(_table_of_points(pairs[0][2], unit), *words, *notes)
     else:
         print_page(_table_of_pairs(pairs), _summary([pair[2] for pair in pairs]), *notes)
@@ -170,30 +174,37 @@ def _sentence(found: Comparison) -> str:
     )
 
 
-def _what_differs(first: ImageTransform, second: ImageTransform) -> list[str]:
-    """What two calibrations of one probe should have in common, and do not, in words."""
+def what_differs(
+    names: tuple[str, str],
+    sizes: tuple[Float[np.ndarray, " 2"] | None, Float[np.ndarray, " 2"] | None],
+    whose: tuple[str, str],
+) -> list[str]:
+    """What two calibrations, or one and a recording, should have in common and do not, in words.
+
+    Args:
+        names: of the probe's frame; Probe where none is known.
+        sizes: [lateral, axial] of a pixel, mm.
+        whose: what these are those of.
+    """
     import numpy as np
 
     from jaxcal.runtime.messages import quoted
 
     words = []
-    # Probe where a file names none.
-    named = {first.probe_frame, second.probe_frame} - {"Probe"}
-    if len(named) == 2:
-        names = f"{quoted(first.probe_frame)} and {quoted(second.probe_frame)}"
-        words.append(f"The frames of the probe have different names: {names}.")
-    sizes = [
-        each.scale_mm_per_px * [1.0, each.range_factor]
-        for each in (first, second)
-        if each.scale_mm_per_px is not None
-    ]
-    if len(sizes) == 2 and (abs(np.log(sizes[0] / sizes[1])) > np.log(_OTHER_PIXELS)).any():
-        one, other = (f"{lateral:.4f} x {axial:.4f} mm" for lateral, axial in sizes)
+    if len({*names} - {"Probe"}) == 2:
         words.append(
-            f"A pixel is {one} by the first and {other} by the second: were they taken at "
-            "one depth setting?"
+            f"The frames of the probe have different names: {quoted(names[0])} in {whose[0]}, "
+            f"{quoted(names[1])} in {whose[1]}."
         )
-    return words
+    one, other = sizes
+    if one is None or other is None or (abs(np.log(one / other)) < np.log(_OTHER_PIXELS)).all():
+        return words
+    told = [f"{lateral:.4f} x {axial:.4f} mm" for lateral, axial in (one, other)]
+    return [
+        *words,
+        f"A pixel is {told[0]} in {whose[0]} and {told[1]} in {whose[1]}: were they taken at one "
+        "depth setting?",
+    ]
 
 
 def _summary(found: list[Comparison]) -> str:
