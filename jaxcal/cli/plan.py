@@ -52,7 +52,10 @@ _PICTURES = (
 @click.command(short_help="Plan which poses to take images from.")
 @click.argument("recording", type=click.Path(), metavar="[REC]", required=False)
 @click.option(
-    "--images", type=click.IntRange(1, 2000), metavar="N", help="Poses.  [default: 30; with REC 10]"
+    "--images",
+    type=click.IntRange(1, 2000),
+    metavar="N",
+    help="Poses; without REC at least 4.  [default: 30; with REC 10]",
 )
 @click.option(
     "--until-tre",
@@ -335,7 +338,9 @@ def _print(
 
     table = Table(box=box.SIMPLE)
     for heading in ("", "how to hold the probe", "lateral, depth\n(mm)", "error then\n(mm)"):
-        table.add_column(heading, justify="left" if "hold" in heading else "right")
+        # Folded: a narrow terminal would cut off the ends of words.
+        justify = "left" if "hold" in heading else "right"
+        table.add_column(heading, justify=justify, overflow="fold")
     for k, pose in enumerate(record["poses"]):
         lateral, depth = pose["target_mm"]
         sign = " (fills space)" if pose["fills_space"] else ""
