@@ -29,8 +29,10 @@ from jaxcal.cli import common, demo, plan
 from jaxcal.cli.main import commands, main
 from jaxcal.cli.run import run
 from jaxcal.data.recording import Recording, make_images
+from jaxcal.design.constraints import Region
 from jaxcal.io.atomic import save_figure
 from jaxcal.io.outputs import begins_with, check_output
+from jaxcal.result.transform import ImageTransform
 from jaxcal.runtime import jax_cache, program_cache
 from jaxcal.study.simulation import Protocol
 
@@ -802,7 +804,29 @@ def test_plan_from_a_recording_keeps_the_region_that_no_option_changes(simulated
     seen = region()
     assert seen["depth_mm"][1] > 90
     assert region("--lateral", 3) == seen | {"lateral_mm": [-3.0, 3.0]}
-    assert region("--depth", 30, 40) == seen | {"depth_mm": [30.0, 40.0]}
+    said = told(capfd, "plan", simulated, "--until-tre", 5, "--depth", 30, 40)
+    left, right = (f"{round(side)}" for side in seen["lateral_mm"])
+    assert f"Target 30 to 40 mm deep, laterally from {left} to {right} mm" in said
+    assert "The existing images reach 5 mm already (0." in said
+
+
+def test_the_region_of_pixels_is_about_the_middle_of_the_image(tmp_path, capfd):
+    """Lateral positions of pixels count from the left edge: there is nothing at -3 mm."""
+    seen, pixels = Region((0.0, 60.0), (5.0, 99.0)), ImageTransform(np.eye(4), np.full(2, 0.1))
+    images = make_images(np.tile(np.eye(4), (8, 1, 1)), np.ones((8, 2)), "pixel")
+
+    def lateral(half, size, transform=pixels):
+        columns = plan._columns(replace(images, frame_size=size), seen, transform)
+        return plan._region(seen, None, half, *columns).lateral_mm
+
+    assert lateral(3.0, None) == (27.0, 33.0)
+    assert lateral(40.0, None) == (0.0, 70.0)
+    assert lateral(40.0, (601, 1000)) == (0.0, 60.0)
+    assert lateral(None, (601, 1000)) == seen.lateral_mm
+    assert lateral(3.0, None, ImageTransform(np.eye(4))) == (-3.0, 3.0)
+    jaxcal.save(Recording(replace(images, spacing_mm=np.full(2, 0.1))), tmp_path / "pixels.h5")
+    said = refused(capfd, "plan", tmp_path / "pixels.h5", "--probe", "linear")
+    assert "where the transducer is in the image is not known" in said
 
 
 @pytest.mark.usefixtures("calibrated")
@@ -829,9 +853,10 @@ def test_a_figure_of_a_plan_is_known_as_a_picture_and_may_be_replaced(tmp_path, 
 
 
 def test_plan_from_nothing_is_words_and_counts(capfd):
-    out = told(capfd, "plan", "--images", 6, "--cone", 20, "--seed", 1)
+    out = told(capfd, "plan", "--images", 6, "--cone", 20, "--seed", 1, "--sigma", 0.1, 0.1, 0.2)
     assert "tilt 20 degrees" in out
-    assert "Images needed" in out
+    # Fewer are not enough to estimate the SDs, and --until-tre plans no fewer.
+    assert "Images needed for an error of 0.5 mm: 8; 0.3 mm: 8;" in out
     assert out.count("target") >= 6
 
 
@@ -862,6 +887,7 @@ def test_plans_that_cannot_be(capfd, tmp_path):
         (["--depth", 80, 20], "in order"),
         (["--lateral", 30], "reaches 29.2 mm to either side"),
         (["--images", 2], "between 4 and"),
+        (["--cone", 86], "'--cone': 86.0 is not in the range"),
         ([tmp_path / "absent.h5"], "absent"),
         (["--images", 5, "--figure", tmp_path / "no" / "p.png"], "folder does not exist"),
         (["--images", 5, "--figure", tmp_path / "p.xyz"], "these endings work: "),

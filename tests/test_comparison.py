@@ -194,3 +194,29 @@ def test_calibrations_of_other_images_of_one_probe_agree(tmp_path, capsys):
     (pair,) = json.loads(capsys.readouterr().out)["pairs"]
     assert len(pair["points"]) == 5
     assert 0.1 < pair["rms_mm"] / pair["expected_rms_mm"] < 2.0
+
+
+def told(capsys, *names: str) -> str:
+    main(["compare", *names, *PIXELS])
+    return " ".join(capsys.readouterr().out.split())
+
+
+def test_what_two_calibrations_should_share_and_do_not_is_told(files, tmp_path, capsys):
+    record = json.loads(Path(files[1]).read_text())
+    Path(files[1]).write_text(json.dumps(record | {"source": "rec.h5"}))
+    again = str(tmp_path / "again.tfm")
+    jaxcal.load_calibration(files[0]).save(again)
+    for names in ((files[0], files[0]), (files[0], again)):
+        assert "The two are one and the same calibration" in told(capsys, *names)
+    other = str(tmp_path / "other.json")
+    frames = {"from": "Port 1", "to": None}
+    changed = record | {"scale_mm_per_px": [0.05, 0.12], "source": "rec.h5", "pose_frames": frames}
+    Path(other).write_text(json.dumps(changed))
+    said = told(capsys, files[1], other)
+    assert "A pixel is 0.1000 x 0.1200 mm in the first and 0.0500 x 0.1200 mm in the second" in said
+    assert "made from 'rec.h5'. If that is one recording, they share its errors" in said
+    assert "different names" not in said
+    Path(files[0]).write_text(json.dumps(record | {"pose_frames": {"from": "Wand", "to": None}}))
+    said = told(capsys, files[0], other)
+    assert "have different names: 'Wand' in the first, 'Port 1' in the second." in said
+    assert "one depth" not in told(capsys, *files[:2])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 import shutil
 from dataclasses import replace
 
@@ -267,6 +269,27 @@ def test_an_extension_without_a_format(folder, name, capsys):
     assert f"{name}: its extension names no format (there are .json," in capsys.readouterr().err
     shutil.copy("cal.json", name)  # the JSON is understood without one
     assert main(["export", name, "--plus"]) == 0
+
+
+def test_applied_to_a_recording_of_another_depth_or_body_is_told(folder, capsys):
+    images = jaxcal.load("rec.h5").calibration
+    size = np.array(random_transform().scale_mm_per_px)
+    for name, pixel, body in (("same.h5", size, "Probe"), ("other.h5", 2 * size, "Wand")):
+        changed = replace(images, spacing_mm=pixel)
+        jaxcal.save(Recording(changed, pose_frames=(body, "Tracker")), name)
+    record = json.loads((folder / "cal.json").read_text())
+    named = record | {"pose_frames": {"from": "Port 1", "to": "Tracker"}}
+    (folder / "named.json").write_text(json.dumps(named))
+    assert main(["apply", "cal.json", "same.h5"]) == 0
+    assert capsys.readouterr().err == ""
+    assert main(["apply", "named.json", "other.h5"]) == 0
+    said = capsys.readouterr().err
+    assert (
+        "- The frames of the probe have different names: 'Port 1' in named.json, 'Wand' in" in said
+    )
+    assert re.search(
+        r"- A pixel is \S+ x \S+ mm in named\.json and \S+ x \S+ mm in other\.h5", said
+    )
 
 
 def test_images_and_lines_keep_their_numbers(folder, capsys):

@@ -23,7 +23,8 @@ from jaxcal.runtime.jax_modes import inside_transformation
 
 @pytest.fixture(scope="module")
 def recording():
-    return experiment(3, images=24, elevation_mm=1.0)
+    named = ("US_Probe", "Reference")
+    return replace(experiment(3, images=24, elevation_mm=1.0), pose_frames=named)
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +46,13 @@ def test_record_in_memory_is_the_command_lines(result, recording):
     theirs = calibration_record(result, replace(recording, test=None, truth=None))
     for name in set(theirs) - {"source"}:
         assert mine[name] == theirs[name], name
+
+
+def test_saved_by_the_name_of_the_recordings_frame(result, tmp_path):
+    assert result.record()["pose_frames"] == {"from": "US_Probe", "to": "Reference"}
+    for extension in ("json", "npz"):
+        result.save(tmp_path / f"cal.{extension}")
+        assert load_calibration(tmp_path / f"cal.{extension}").probe_frame == "US_Probe"
 
 
 def test_notebooks_get_a_drawing_and_no_script(result):

@@ -234,6 +234,19 @@ def test_test_images_that_are_calibrated_with_are_refused(recording):
     half = dataclasses.replace(images, mask=np.arange(20) < 5)
     others = dataclasses.replace(images, mask=np.arange(20) > LEFT_OUT)
     assert check_test_images(Recording(half), Recording(others)) is others
+    # Poses of another body, and pixels of another size.
+    wand = Recording(others, source="w.h5", pose_frames=("Wand", "Tracker"))
+    probe = Recording(half, source="p.h5", pose_frames=("Probe", "Reference"))
+    with pytest.raises(InputError, match=r"w\.h5: .* of 'Wand', not of 'Probe' as in p\.h5"):
+        check_test_images(probe, wand)
+    moved = dataclasses.replace(wand, pose_frames=("Probe", "Tracker"))
+    assert check_test_images(probe, moved) is others
+    ours, theirs = (
+        Recording(make_images(each.poses, abs(each.measurements), "pixel", frame_size=size))
+        for each, size in ((half, (600, 400)), (others, (640, 480)))
+    )
+    with pytest.raises(InputError, match="its frames have 640 x 480 px, those to calibrate with"):
+        check_test_images(ours, theirs)
     with pytest.raises(InputError, match="14 of 14 test images"):
         check_test_images(Recording(images, test=others))
 

@@ -70,7 +70,9 @@ def test_plus_matrix_is_jaxcals_model(seed):
     assert matrix[:3, 2] @ known.image_plane_to_probe[:3, 1] < 0
 
 
-@pytest.mark.parametrize("extension", ["json", "xml", "tfm", "txt", "h5", "csv", "npy", "npz"])
+@pytest.mark.parametrize(
+    "extension", ["json", "xml", "tfm", "txt", "h5", "yaml", "csv", "npy", "npz"]
+)
 def test_saved_and_loaded(tmp_path, extension):
     known = random_transform()
     path = tmp_path / f"cal.{extension}"
@@ -81,6 +83,8 @@ def test_saved_and_loaded(tmp_path, extension):
                         "</PlusConfiguration>")  # fmt: skip
     found = load_calibration(path)
     np.testing.assert_allclose(found.plus_matrix(), known.plus_matrix(), rtol=0, atol=1e-12)
+    pixel = np.array([300.0, 400.0])
+    np.testing.assert_allclose(found.apply(pixel).points, known.apply(pixel).points, atol=1e-12)
     np.testing.assert_allclose(
         found.image_plane_to_probe[:3, :3], known.image_plane_to_probe[:3, :3], atol=1e-13
     )
@@ -95,13 +99,37 @@ def test_saved_and_loaded(tmp_path, extension):
         np.testing.assert_array_equal(load_calibration(path).plus_matrix(), found.plus_matrix())
 
 
+@pytest.mark.parametrize("extension", ["json", "yaml", "npz"])
+def test_points_in_mm_are_saved_and_loaded(tmp_path, extension):
+    """The range of a measured range of 0 and the sound speed are no part of the rigid transform."""
+    known = replace(random_transform(), scale_mm_per_px=None, range_factor=0.9991)
+    known.save(tmp_path / f"cal.{extension}")
+    found = load_calibration(tmp_path / f"cal.{extension}")
+    assert (found.scale_mm_per_px, found.face_offset_mm, found.range_factor) == (None, 1.5, 0.9991)
+    point = np.array([12.0, 40.0])
+    np.testing.assert_allclose(found.apply(point).points, known.apply(point).points, atol=1e-12)
+
+
+@pytest.mark.parametrize("held", ["[1]", "{", '{"face_offset_mm": "x"}', '{"range_factor": -1}'])
+def test_yaml_that_lies(tmp_path, held):
+    text = random_transform().text("ros")
+    path = tmp_path / "cal.yaml"
+    path.write_text(re.sub("(?m)^# jaxcal: .*$", f"# jaxcal: {held}", text))
+    with pytest.raises(InputError, match=r"^\S+cal\.yaml:"):
+        load_calibration(path)
+    path.write_text(re.sub("(?m)^(# jaxcal: .*)$", r"\1\n\1", text))
+    with pytest.raises(FormatError, match="must stand once"):
+        load_calibration(path)
+
+
 def test_npz_keeps_what_the_uncertainty_needs(tmp_path):
     """Estimated pixel sizes and sound speed included; older files have fewer names."""
     unknowns = ("translation", "rotation", "scale", "sound-speed")
     root = np.random.default_rng(1).normal(size=(9, 9)) * [*[0.2] * 3, *[0.01] * 3, *[0.004] * 3]
     known = replace(
-        random_transform(), unknowns=unknowns, image_covariance=root.T @ root, range_factor=0.99
-    )
+        random_transform(), unknowns=unknowns, image_covariance=root.T @ root, range_factor=0.99,
+        probe_frame="Stylus",
+    )  # fmt: skip
     for name in ("cal.npz", "cal.json"):
         known.save(tmp_path / name)
         found = load_calibration(tmp_path / name)
@@ -112,6 +140,8 @@ def test_npz_keeps_what_the_uncertainty_needs(tmp_path):
         np.testing.assert_array_equal(applied.points, expected.points)
         np.testing.assert_array_equal(applied.covariance, expected.covariance)
         assert (found.unknowns, found.converged, found.error_mm) == (unknowns, True, 0.7)
+        assert found.probe_frame == "Stylus"
+        assert found.date is not None
     old = ("image_plane_to_probe", "scale_mm_per_px", "covariance", "face_offset_mm")
     with np.load(tmp_path / "cal.npz") as file:
         np.savez(tmp_path / "old.npz", **{name: file[name] for name in old})
@@ -206,7 +236,7 @@ def test_ros_is_rigid_and_in_metres(tmp_path):
     known = random_transform()
     known.save(tmp_path / "cal.yaml")
     np.testing.assert_allclose(
-        read_ros_yaml(tmp_path / "cal.yaml"), known.image_plane_to_probe, atol=1e-12
+        read_ros_yaml(tmp_path / "cal.yaml")[0], known.image_plane_to_probe, atol=1e-12
     )
     text = (tmp_path / "cal.yaml").read_text()
     x = float(re.search(r"--x (\S+) ", text)[1])
@@ -224,7 +254,7 @@ def test_ros_is_rigid_and_in_metres(tmp_path):
     assert "x: 1.0e-05\n" in tiny.text("ros")
     edited = tiny.text("ros").replace("qw: 1.0", "qw: 1.0  # the scalar")
     (tmp_path / "cal.yaml").write_text(edited)
-    np.testing.assert_array_equal(read_ros_yaml(tmp_path / "cal.yaml")[:3, 0], [1, 0, 0])
+    np.testing.assert_array_equal(read_ros_yaml(tmp_path / "cal.yaml")[0][:3, 0], [1, 0, 0])
     (tmp_path / "cal.yaml").write_text(edited.replace("qw: 1.0", "qw: 1.0#"))
     with pytest.raises(FormatError, match=r"qw is not a number: '1\.0#'"):
         read_ros_yaml(tmp_path / "cal.yaml")
@@ -250,7 +280,7 @@ def test_ros_says_what_a_rigid_transform_cannot_hold(tmp_path, capsys):
     # With that both agree.
     pixel = np.array([300.0, 400.0])
     lateral, deep = known.scale_mm_per_px * pixel
-    rigid = read_ros_yaml(tmp_path / "a.yaml")
+    rigid, _ = read_ros_yaml(tmp_path / "a.yaml")
     found = rigid @ [lateral, 0.0, 0.9991 * deep + 1.5, 1.0]
     np.testing.assert_allclose(found[:3], known.apply(pixel).points[0], atol=1e-9)
     points = replace(random_transform(offset=0.0), scale_mm_per_px=None)
@@ -602,6 +632,35 @@ def saved(tmp_path):
 def test_export_to_standard_output(saved, capsys, name):
     assert main(["export", str(saved), f"--{name}"]) == 0
     assert capsys.readouterr().out == random_transform().text(name)
+
+
+def test_the_ending_names_the_format(saved, tmp_path, capsys):
+    for ending in ("xml", "tfm", "yaml", "csv", "npy", "npz"):
+        out = tmp_path / f"a.{ending}"
+        assert main(["export", str(saved), str(out)]) == 0
+        np.testing.assert_allclose(
+            load_calibration(out).plus_matrix(), random_transform().plus_matrix(), atol=1e-12
+        )
+    assert main(["export", str(saved), str(tmp_path / "a.doc")]) == 2
+    assert "its extension names no format" in capsys.readouterr().err
+
+
+def test_a_name_that_plus_refuses_is_told(saved, tmp_path, capsys):
+    """NDI ToolBox calls its tools Port 1."""
+    saved.write_text(json.dumps(good_record() | {"pose_frames": {"from": "Port 1", "to": "T"}}))
+    note = "calls the probe's frame 'Port 1', which PLUS refuses: written as Probe"
+    for name, said in (("plus", note), ("ros", note), ("slicer", None)):
+        assert main(["export", str(saved), f"--{name}"]) == 0
+        assert (said or "calls") not in (found := capsys.readouterr()).out
+        assert found.err.count(note) == (said is not None)
+    assert main(["export", str(saved), "--plus", "--probe-frame", "Wand"]) == 0
+    found = capsys.readouterr()
+    assert (found.err, 'To="Wand"' in found.out) == ("", True)
+    load_calibration(saved).save(tmp_path / "again.json")
+    assert load_calibration(tmp_path / "again.json").probe_frame == "Port 1"
+    saved.write_text(json.dumps(good_record() | {"pose_frames": {"from": "Tip-1", "to": "T"}}))
+    assert main(["export", str(saved), "--ros"]) == 2
+    assert "'Tip-1' cannot name a frame in ROS: letters, digits, _ and /" in capsys.readouterr().err
 
 
 def test_export_to_files(saved, tmp_path, capsys):

@@ -176,7 +176,8 @@ def calibrate(
     # Not in own modes: segmenting times of flight imports JAX, whose modes are entered after that.
     found = _calibrated(as_problem(problem, "jaxcal.calibrate"), request)
     if isinstance(problem, Recording):
-        found, problem = replace(found, probe=problem.probe), problem.calibration
+        found = replace(found, probe=problem.probe, pose_frames=problem.pose_frames)
+        problem = problem.calibration
     return replace(found, frame_size=problem.frame_size) if isinstance(problem, Images) else found
 
 

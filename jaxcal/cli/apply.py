@@ -60,6 +60,7 @@ def apply(
     """
     import numpy as np
 
+    from jaxcal.cli.compare import what_differs
     from jaxcal.io.atomic import write_text
     from jaxcal.io.outputs import begins_with, check_output
     from jaxcal.io.table import csv_text
@@ -77,11 +78,14 @@ def apply(
     transform.check_usable()
     points, poses, numbers = np.array(pixel), None, None
     if source is not None:
-        points, poses, kind, numbers = _read(source, table)
+        points, poses, kind, numbers, spacing, frame = _read(source, table)
         pixels = transform.scale_mm_per_px is not None
         if kind != ("pixel" if pixels else "point"):
             wanted = "pixels" if pixels else "points in mm"
             raise InputError(f"{source}: holds {kind} data, the calibration takes {wanted}")
+        names, sizes = (transform.probe_frame, frame), (transform.scale_mm_per_px, spacing)
+        for note in what_differs(names, sizes, (calibration, source)):
+            click.echo(f"- {note}", err=True)
     elif transform.scale_mm_per_px is None:
         click.echo(
             f"{calibration}: knows no pixel size, so --pixel takes points in mm: lateral, range",
@@ -113,14 +117,20 @@ def _given(options: dict[str, Any]) -> str:
 
 
 def _read(source: str, options: dict[str, Any]):
-    """Points, poses or None, the points' kind, and the images or lines that they are of."""
+    """Points, poses or None, the points' kind, and the images or lines that they are of.
+
+    Then the size of a pixel (mm) and the name of the probe's frame, as far as the file knows them.
+    """
     if _is_recording(source):
         from jaxcal.io.hdf5 import load
 
-        images = load(source).calibration
+        recording = load(source)
+        images = recording.calibration
         used = images.mask
         which = "image", used.nonzero()[0].tolist()
-        return images.measurements[used], images.poses[used], images.kind, which
+        frame = (recording.pose_frames or ("Probe",))[0]
+        read = images.measurements[used], images.poses[used], images.kind, which
+        return *read, images.spacing_mm, frame
     from jaxcal.io.sources import SEQUENCES, kind_of
     from jaxcal.io.text import read_pose_table
 
@@ -136,4 +146,5 @@ def _read(source: str, options: dict[str, Any]):
     of_poses = _given(options | {"skip_invalid": False})
     if of_poses and table.poses is None:
         raise click.UsageError(f"{of_poses}: for poses, but {source} holds none")
-    return table.points, table.poses, table.kind, ("line", table.lines) if skipping else None
+    which = ("line", table.lines) if skipping else None
+    return table.points, table.poses, table.kind, which, None, "Probe"

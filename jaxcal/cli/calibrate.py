@@ -317,9 +317,10 @@ def _check_exports(
     And configurations of PLUS that cannot take the transform to the recording's probe.
     """
     from jaxcal.cli.export import check_configuration
-    from jaxcal.result.saved import needs_pixels, probe_frame
+    from jaxcal.io.frame_names import probe_name
+    from jaxcal.result.saved import needs_pixels
 
-    frames = "Image", probe_frame((recording.pose_frames or (None,))[0])
+    frames = "Image", probe_name((recording.pose_frames or ("Probe",))[0])
     for format, path in targets:
         if recording.calibration.kind != "pixel" and needs_pixels(path, format):
             raise InputError(
@@ -336,8 +337,9 @@ def _export(
     """Write the transform for other programs; nothing of a calibration that did not converge."""
     if not targets:
         return []
-    from jaxcal.cli.export import patched, written
-    from jaxcal.result.saved import transform_from_record
+    from jaxcal.cli.export import NAMING, patched, written
+    from jaxcal.io.frame_names import probe_name
+    from jaxcal.result.saved import renamed, transform_from_record
 
     if not record["converged"] or record["wrong_frames"]:
         return ["exported: nothing, because the calibration must not be used"]
@@ -345,9 +347,11 @@ def _export(
     said: list[str] = []
     for format, path in targets:
         if format == "plus":
-            said += patched(transform, path, None, ("Image", transform.probe_frame))
+            said += patched(transform, path, None, ("Image", probe_name(transform.probe_frame)))
         else:
             said += written(transform, path, format)
+        if (note := renamed(transform)) is not None and format in NAMING:
+            said.append(f"- {note}")
     return said
 
 

@@ -11,12 +11,19 @@ import click
 from jaxcal.cli.common import ExitCode, json_option, print_json, print_page
 
 if TYPE_CHECKING:
+    import numpy as np
     from rich.table import Table
 
     from jaxcal.diagnostics.comparison import Comparison
+    from jaxcal.runtime.array_types import Float
 
 MOST_FILES = 100
 """Most calibrations that are compared at once, each with each."""
+
+_SAME = 1e-3
+"""Share of the expected distance (of 1 mm, if that is not known) below which two are the same."""
+_OTHER_PIXELS = 1.02
+"""Ratio of two pixel sizes from which on the depth setting is likely to have changed."""
 
 
 @click.command(short_help="Say whether calibrations of one probe agree.")
@@ -44,7 +51,8 @@ def compare(
 
     from jaxcal import InputError
     from jaxcal.diagnostics.comparison import compare_calibrations
-    from jaxcal.result.saved import load_calibration, stated_points
+    from jaxcal.result.saved import load_calibration, stated_points, stated_source
+    from jaxcal.runtime.messages import quoted
 
     if not 2 <= len(calibrations) <= MOST_FILES:
         raise click.UsageError(f"name 2 to {MOST_FILES} calibrations, not {len(calibrations)}")
@@ -65,13 +73,24 @@ def compare(
         )
         for a, b in combinations(range(len(transforms)), 2)
     ]
+    sources = [stated_source(name) for name in calibrations]
+    shared = sorted({name for name in sources if name and sources.count(name) > 1})
+    notes = [
+        f"Several calibrations state that they were made from {quoted(name)}. If that is one "
+        "recording, they share its errors, and their distance says nothing about their accuracy."
+        for name in shared
+    ]
     if as_json:
         print_json({"pairs": [_record(*pair) for pair in pairs]})
     elif len(pairs) == 1:
         unit = "mm" if transforms[0].scale_mm_per_px is None else "px"
-        print_page(_table_of_points(pairs[0][2], unit), _sentence(pairs[0][2]))
+        names, sizes = zip(
+            *((each.probe_frame, each.scale_mm_per_px) for each in transforms), strict=True
+        )
+        words = [_sentence(pairs[0][2]), *what_differs(names, sizes, ("the first", "the second"))]
+        print_page(_table_of_points(pairs[0][2], unit), *words, *notes)
     else:
-        print_page(_table_of_pairs(pairs), _summary([pair[2] for pair in pairs]))
+        print_page(_table_of_pairs(pairs), _summary([pair[2] for pair in pairs]), *notes)
     apart = any(pair[2].agree is False for pair in pairs)
     return ExitCode.UNCERTAIN if apart else ExitCode.CONVERGED
 
@@ -135,6 +154,12 @@ def _sentence(found: Comparison) -> str:
         f"image points are {found.rms_mm:.2f} mm apart (RMS), and the two images are turned by "
         f"{found.rotation_deg:.2f} degrees against each other"
     )
+    expected = 1.0 if found.agree is None else found.expected_rms_mm
+    if found.rms_mm < _SAME * expected:
+        return (
+            "The two are one and the same calibration, which says nothing about its accuracy: "
+            "compare calibrations from different recordings."
+        )
     if found.agree is None:
         return (
             f"{apart[0].upper()}{apart[1:]}. How far apart they should be is not known: a file "
@@ -147,6 +172,39 @@ def _sentence(found: Comparison) -> str:
         f"The calibrations do not agree: {apart}. {limit} At least one is less accurate than it "
         "states, or the probe's marker or the geometry of its image changed in between."
     )
+
+
+def what_differs(
+    names: tuple[str, str],
+    sizes: tuple[Float[np.ndarray, " 2"] | None, Float[np.ndarray, " 2"] | None],
+    whose: tuple[str, str],
+) -> list[str]:
+    """What two calibrations, or one and a recording, should have in common and do not, in words.
+
+    Args:
+        names: of the probe's frame; Probe where none is known.
+        sizes: [lateral, axial] of a pixel, mm.
+        whose: what these are those of.
+    """
+    import numpy as np
+
+    from jaxcal.runtime.messages import quoted
+
+    words = []
+    if len({*names} - {"Probe"}) == 2:
+        words.append(
+            f"The frames of the probe have different names: {quoted(names[0])} in {whose[0]}, "
+            f"{quoted(names[1])} in {whose[1]}."
+        )
+    one, other = sizes
+    if one is None or other is None or (abs(np.log(one / other)) < np.log(_OTHER_PIXELS)).all():
+        return words
+    told = [f"{lateral:.4f} x {axial:.4f} mm" for lateral, axial in (one, other)]
+    return [
+        *words,
+        f"A pixel is {told[0]} in {whose[0]} and {told[1]} in {whose[1]}: were they taken at one "
+        "depth setting?",
+    ]
 
 
 def _summary(found: list[Comparison]) -> str:

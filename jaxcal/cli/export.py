@@ -24,8 +24,8 @@ _TEXTS = {
     "numpy": "PLUS's matrix (OUT.npy), or all that is known (OUT.npz).",
 }
 
-_NAMELESS = ("slicer", "itk", "tusrec", "numpy")
-"""Formats without names of frames."""
+NAMING = ("plus", "ros")
+"""Formats that name the frames."""
 
 
 def _one_format(_: click.Context, __: click.Parameter, given: tuple[str, ...]) -> str | None:
@@ -91,29 +91,36 @@ def export(
 ) -> int:
     """Write the calibration CAL for another program, to OUT or to standard output.
 
+    The ending of OUT names the format if no option does (.xml, .tfm, .yaml, .csv, .npz, ...).
+
     CAL is the JSON of "jaxcal calibrate", or another program's calibration (a configuration or fCal
     result of PLUS, an ITK transform, calib_matrix.csv, a YAML of easy_handeye). PLUS's and Slicer's
     ImageToProbe takes pixels (u, v, 0, 1) to the probe in mm; ROS gets the rigid transform from the
     image plane in metres.
     """
-    if sum(chosen is not None for chosen in (format, plus_config, plus_server)) != 1:
+    from jaxcal.io.frame_names import probe_name
+    from jaxcal.result.saved import check_target, load_calibration, renamed
+
+    asked = sum(chosen is not None for chosen in (format, plus_config, plus_server))
+    if asked == 0 and out is not None:
+        format, asked = check_target(out, None, [calibration]), 1
+    if asked != 1:
         names = ", ".join(f"--{name}" for name in (*_TEXTS, "plus-config"))
         raise click.UsageError(f"name one format: {names} or --plus-server")
     if plus_server is not None and out is not None:
         raise click.UsageError("--plus-server writes no file: leave OUT out")
     if origin is not None and pixel_size is None:
         raise click.BadParameter("needs --pixel-size", param_hint="--origin")
-    if (image_frame, probe_frame or "Probe") != ("Image", "Probe") and format in _NAMELESS:
+    named = format is None or format in NAMING
+    if (image_frame, probe_frame or "Probe") != ("Image", "Probe") and not named:
         raise click.UsageError(
             f"--{format} names no frames: leave --image-frame, --probe-frame out"
         )
-    from jaxcal.result.saved import check_target, load_calibration
-
     if plus_config is None and out is not None:
         format = check_target(out, format, [calibration])
     transform = load_calibration(calibration)
     transform.check_usable()
-    frames = image_frame, probe_frame or transform.probe_frame
+    frames = image_frame, probe_frame or probe_name(transform.probe_frame)
     if plus_config is not None:
         check_configuration(plus_config, out, [calibration], frames)
     if pixel_size is not None:
@@ -128,6 +135,8 @@ def export(
             click.echo(line)
     elif format is not None:
         click.echo(transform.text(format, frames=frames), nl=False)
+    if named and probe_frame is None and (note := renamed(transform)) is not None:
+        click.echo(f"- {note}", err=True)
     return ExitCode.CONVERGED
 
 

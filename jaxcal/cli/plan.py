@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import asdict, replace
+from math import inf
 from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
 from jaxcal import InputError
 from jaxcal.cli.common import (
-    NOT_NEGATIVE,
     POSITIVE,
     ExitCode,
     import_engine,
@@ -25,8 +25,10 @@ from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
 from jaxcal.study.laws import OFFSET_LAWS, LawName
 
 if TYPE_CHECKING:
+    from jaxcal.data.recording import Images
     from jaxcal.design import Candidates, Plan
     from jaxcal.design.constraints import Region
+    from jaxcal.result.transform import ImageTransform
 
 _COUNTED = (0.5, 0.3, 0.2, 0.1)
 """Errors (mm) for which the images are counted, where none is asked for."""
@@ -50,7 +52,10 @@ _PICTURES = (
 @click.command(short_help="Plan which poses to take images from.")
 @click.argument("recording", type=click.Path(), metavar="[REC]", required=False)
 @click.option(
-    "--images", type=click.IntRange(1, 2000), metavar="N", help="Poses.  [default: 30; with REC 10]"
+    "--images",
+    type=click.IntRange(1, 2000),
+    metavar="N",
+    help="Poses; without REC at least 4.  [default: 30; with REC 10]",
 )
 @click.option(
     "--until-tre",
@@ -84,18 +89,18 @@ _PICTURES = (
     "--lateral",
     type=POSITIVE,
     metavar="MM",
-    help="Largest lateral position of the target, to either side.  [default: 0.41 of the aperture; "
-    "with REC where it was]",
+    help="Largest lateral position of the target, to either side of the middle (in pixels, of the "
+    "middle of where it was).  [default: 0.41 of the aperture; with REC where it was]",
 )
 @click.option(
     "--cone",
-    type=NOT_NEGATIVE,
+    type=click.FloatRange(0, 85),
     metavar="DEG",
     help="Largest tilt.  [default: 40; with REC that of its images, at least 30]",
 )
 @click.option(
     "--turn",
-    type=NOT_NEGATIVE,
+    type=click.FloatRange(0, 180),
     metavar="DEG",
     help="Largest turn about the beam's direction.  [default: 90; with REC that of its images, at "
     "least 60]",
@@ -187,17 +192,36 @@ def plan(
     if as_json:
         print_json(record)
     else:
-        _print(found, record, figure)
+        _print(found, record, figure, until_tre)
     return ExitCode.CONVERGED
 
 
-def _region(whole: Region, depth: tuple[float, float] | None, lateral: float | None) -> Region:
+def _region(
+    whole: Region,
+    depth: tuple[float, float] | None,
+    lateral: float | None,
+    middle: float = 0.0,
+    edges: tuple[float, float] = (-inf, inf),
+) -> Region:
     """A region, with the depths and lateral positions that were asked for in the place of its."""
-    return replace(
-        whole,
-        depth_mm=whole.depth_mm if depth is None else depth,
-        lateral_mm=whole.lateral_mm if lateral is None else (-lateral, lateral),
-    )
+    if lateral is not None:
+        left, right = max(middle - lateral, edges[0]), min(middle + lateral, edges[1])
+        whole = replace(whole, lateral_mm=(left, right))
+    return whole if depth is None else replace(whole, depth_mm=depth)
+
+
+def _columns(
+    images: Images, seen: Region, transform: ImageTransform
+) -> tuple[float, tuple[float, float]]:
+    """The middle to which ``--lateral`` refers, and the edges of the image, lateral, mm.
+
+    Pixels count from the image's left edge, and points in mm from the transducer's middle.
+    """
+    scale, size = transform.scale_mm_per_px, images.frame_size
+    if scale is None:
+        return 0.0, (-inf, inf)
+    last = inf if size is None else float(scale[0] * (size[0] - 1))
+    return sum(seen.lateral_mm) / 2, (0.0, last)
 
 
 def _from_nothing(
@@ -254,6 +278,11 @@ def _from_recording(
             "wrong: leave it out here"
         )
     measured, _ = segmented(load(path))
+    if probe is not None and measured.calibration.kind == "pixel":
+        raise InputError(
+            f"--probe {probe}: {path} holds pixels, and where the transducer is in the image is "
+            "not known: leave --probe out (--depth and --lateral set the region)"
+        )
     with progress("calibrating"), naming(path):
         result = calibrate(measured, estimate=names)
     if result.status == "failed":
@@ -270,7 +299,9 @@ def _from_recording(
 
     candidates = around(None)
     if depth is not None or lateral is not None:
-        candidates = around(_region(candidates.constraints.region, depth, lateral))
+        seen = candidates.constraints.region
+        middle, edges = _columns(measured.calibration, seen, result.image_transform())
+        candidates = around(_region(seen, depth, lateral, middle, edges))
     return result, candidates
 
 
@@ -279,9 +310,12 @@ def _record(found: Plan, recording: str | None, region: Region) -> dict[str, Any
     from jaxcal.report.next_poses import pose_records
 
     counted = {}
+    # As --until-tre counts: fewer are not enough to estimate the SDs.
+    least = 0 if found.known.images else MINIMUM_SELF_TUNING
     for wanted in _COUNTED:
         try:
-            counted[f"{wanted:g}"] = found.known.images + images_to(found, wanted)
+            needed = found.known.images + images_to(found, wanted)
+            counted[f"{wanted:g}"] = max(needed, least)
         except InputError:
             counted[f"{wanted:g}"] = None
     return {
@@ -296,13 +330,17 @@ def _record(found: Plan, recording: str | None, region: Region) -> dict[str, Any
     }
 
 
-def _print(found: Plan, record: dict[str, Any], figure: str | None) -> None:
+def _print(
+    found: Plan, record: dict[str, Any], figure: str | None, until_tre: float | None
+) -> None:
     from rich import box
     from rich.table import Table
 
     table = Table(box=box.SIMPLE)
     for heading in ("", "how to hold the probe", "lateral, depth\n(mm)", "error then\n(mm)"):
-        table.add_column(heading, justify="left" if "hold" in heading else "right")
+        # Folded: a narrow terminal would cut off the ends of words.
+        justify = "left" if "hold" in heading else "right"
+        table.add_column(heading, justify=justify, overflow="fold")
     for k, pose in enumerate(record["poses"]):
         lateral, depth = pose["target_mm"]
         sign = " (fills space)" if pose["fills_space"] else ""
@@ -321,12 +359,18 @@ def _print(found: Plan, record: dict[str, Any], figure: str | None) -> None:
     (near, far), (left, right) = (record["region"][k] for k in ("depth_mm", "lateral_mm"))
     total = "" if not there else ", the existing ones included,"
     before = "" if not there else f" added to the {there} existing ones"
+    reached = there and until_tre is not None and found.tre_mm[0] <= until_tre
     these = "this image" if len(found) == 1 else f"these {len(found)} images"
     print_page(
         table,
         f"Target {near:.0f} to {far:.0f} mm deep, laterally from {left:.0f} to {right:.0f} mm.",
         "Tilts and turns from the middle orientation, with the marker to your right; left is where "
         "the lateral position is smallest. Take them in any order.",
+        *(
+            [f"The existing images reach {until_tre:g} mm already ({found.tre_mm[0]:.2g} mm)."]
+            if reached
+            else []
+        ),
         f"Predicted with {these}{before}: error over the image "
         f"{found.tre_mm[-1]:.2g} mm, reconstruction precision {found.rp_mm[-1]:.2g} mm.",
         *([f"Images needed{total} for an error of {'; '.join(counts)}."] if counts else []),

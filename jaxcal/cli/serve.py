@@ -29,12 +29,13 @@ def serve(calibration: str, host: str, port: int, rate: float, name: str | None)
     In Slicer's OpenIGTLinkIF, add a connector of type client for this host and port. The matrix is
     PLUS's ImageToProbe, with the pixel size in it: leave the image's own spacing at 1.
     """
+    from jaxcal.io.frame_names import probe_name
     from jaxcal.io.serving import TransformServer
     from jaxcal.result.saved import load_calibration
 
     transform = load_calibration(calibration)
     transform.check_usable()
-    name = f"ImageTo{transform.probe_frame}" if name is None else name
+    name = f"ImageTo{probe_name(transform.probe_frame)}" if name is None else name
     with TransformServer(name, transform.plus_matrix(), host, port) as server:
         click.echo(f"{name} at {host}:{server.port}, {rate:g} times a second; Ctrl-C ends")
         server.serve(1 / rate)

@@ -66,6 +66,14 @@ def check_frames(frames: FramePair) -> FramePair:
     return source, target
 
 
+def probe_name(named: str) -> str:
+    """A recording's name of the probe's frame as it is written; Probe if PLUS refuses the name."""
+    try:
+        return check_frames(("Image", named))[1]
+    except FormatError:
+        return "Probe"
+
+
 def path_between(pairs: list[FramePair], start: str, end: str) -> list[tuple[int, bool]] | None:
     """The shortest way from one frame to another along transforms and their inverses.
 

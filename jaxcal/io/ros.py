@@ -9,8 +9,10 @@ Source: tf2_ros static_transform_publisher; easy_handeye2.
 
 from __future__ import annotations
 
+import json
 import os
 import re
+from typing import Any
 
 import numpy as np
 
@@ -22,6 +24,8 @@ from jaxcal.runtime.messages import quoted
 
 _KEYS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_/]*")
+_HELD = "# jaxcal: "
+"""How the comment begins that holds, as a JSON object, what a rigid transform leaves out."""
 
 
 def _seven(matrix: Float[np.ndarray, "4 4"]) -> dict[str, str]:
@@ -39,7 +43,10 @@ def _digits(value: float) -> str:
 
 def _checked_name(name: str) -> str:
     if not _NAME.fullmatch(name):
-        raise InputError(f"{quoted(name)} cannot name a frame in ROS")
+        raise InputError(
+            f"{quoted(name)} cannot name a frame in ROS: letters, digits, _ and / are needed "
+            "(another name: jaxcal export --probe-frame, --image-frame)"
+        )
     return name
 
 
@@ -90,16 +97,18 @@ def ros_yaml(
     parent: str = "probe",
     child: str = "us_image",
     note: str | None = None,
+    held: dict[str, Any] | None = None,
 ) -> str:
     """The YAML of easy_handeye2 for a transform (rigid, mm, child -> parent).
 
-    The command of tf2 and a note, as of :func:`range_note`, are comments above it.
+    The command of tf2 and a note, as of :func:`range_note`, are comments above it; so is ``held``,
+    which :func:`read_ros_yaml` returns.
 
     Raises:
         InputError: a matrix that is not rigid, or names that ROS does not take.
     """
     numbers = "".join(f"  {key}: {value}\n" for key, value in _seven(matrix).items())
-    noted = "" if note is None else f"# {note}\n"
+    noted = "" if note is None else f"# {note}\n{_HELD}{json.dumps(held)}\n"
     return (
         f"# {child} in {parent}: metres, unit quaternion with the scalar last.\n"
         f"# axes of {child}: x lateral (along u), y elevational, z depth (along v)\n"
@@ -114,17 +123,34 @@ def ros_yaml(
     )
 
 
-def read_ros_yaml(path: str | os.PathLike[str]) -> Float[np.ndarray, "4 4"]:
+def read_ros_yaml(
+    path: str | os.PathLike[str],
+) -> tuple[Float[np.ndarray, "4 4"], dict[str, Any]]:
     """The rigid transform, mm, of a file as :func:`ros_yaml` or easy_handeye writes it.
 
-    Only the seven numbers are looked for; nothing else of YAML is understood.
+    Only the seven numbers and our comment are looked for; nothing else of YAML is understood.
+
+    Returns:
+        The transform, and the object in our comment, not checked; empty without the comment.
 
     Raises:
-        FormatError: one of them missing, twice or not a number, or no unit quaternion.
+        FormatError: one of the numbers missing, twice or not a number, no unit quaternion, or a
+            comment of ours that holds no JSON object.
     """
     name = os.fspath(path)
     found: dict[str, float] = {}
-    for line, content in text_lines(path):
+    held: dict[str, Any] | None = None
+    for line, content in text_lines(path, comments=True):
+        if content.startswith(_HELD):
+            try:
+                stated = json.loads(content.removeprefix(_HELD))
+            except (ValueError, RecursionError):
+                stated = None
+            if held is not None or not isinstance(stated, dict):
+                raise FormatError(
+                    f"{name}:{line}: {quoted(_HELD.strip())} must stand once, with a JSON object"
+                )
+            held = stated
         match = re.fullmatch(r"\s*(x|y|z|qx|qy|qz|qw):\s*([^\s#]\S*)\s*(?:\s#.*)?", content)
         if match is None:
             continue
@@ -146,4 +172,4 @@ def read_ros_yaml(path: str | os.PathLike[str]) -> Float[np.ndarray, "4 4"]:
     except InputError as error:
         raise FormatError(f"{name}: {error}") from None
     matrix[:3, 3] = [1e3 * found[key] for key in _KEYS[:3]]
-    return matrix
+    return matrix, held or {}

@@ -30,6 +30,7 @@ from jaxcal.report.certified import certificate_record
 from jaxcal.result.calibration import Calibration
 from jaxcal.result.saved import FORMAT, VERSION
 from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.messages import quoted
 
 CONVENTION = {
     "units": "lengths in mm; rotations in rad where no unit is in the name",
@@ -215,8 +216,9 @@ def check_test_images(recording: Recording, test: Recording | None = None) -> Im
     They are the calibration images of ``test``; without it, the recording's own test set.
 
     Raises:
-        InputError: times of flight, pixels without a spacing beside points in mm, or images that
-            are among those to calibrate with.
+        InputError: times of flight, pixels without a spacing beside points in mm or in frames of
+            another size, poses of another frame than the probe's, or images that are among those to
+            calibrate with.
     """
     images = recording.test if test is None else test.calibration
     source = recording.source if test is None else test.source
@@ -228,6 +230,18 @@ def check_test_images(recording: Recording, test: Recording | None = None) -> Im
     if unscaled and recording.calibration.kind != "pixel":
         raise InputError(
             f"{source}: test images are pixels without spacing_mm: their mm are unknown"
+        )
+    ours, theirs = recording.calibration.frame_size, images.frame_size
+    if unscaled and ours and theirs and ours != theirs:
+        raise InputError(
+            f"{source}: its frames have {theirs[0]} x {theirs[1]} px, those to calibrate with "
+            f"{ours[0]} x {ours[1]}: a pixel's size, which is estimated, would be another one"
+        )
+    named, other = recording.pose_frames, None if test is None else test.pose_frames
+    if named and other and named[0] != other[0]:
+        raise InputError(
+            f"{source}: its poses are those of {quoted(other[0])}, not of {quoted(named[0])} as in "
+            f"{recording.source} (import with --from)"
         )
     shared = len(_poses_and_measurements(images) & _poses_and_measurements(recording.calibration))
     if shared:

@@ -47,7 +47,9 @@ def recording_of(calibration: Calibration) -> Recording:
         face_offset_mm=float(np.asarray(problem.face_offset)),
         frame_size=calibration.frame_size,
     )
-    return Recording(images, probe=calibration.probe, source="memory")
+    return Recording(
+        images, probe=calibration.probe, source="memory", pose_frames=calibration.pose_frames
+    )
 
 
 def record_of(

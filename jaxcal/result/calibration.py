@@ -178,6 +178,7 @@ class Calibration:
             are stated for (static; one problem).
         frame_size: (columns, rows) of the frames, px, if a recording has it; the same region does
             not leave them (static; one problem).
+        pose_frames: names of the poses' two frames, if a recording has them (static; one problem).
     """
 
     image_to_probe: Float[AnyArray, "*batch 4 4"]
@@ -205,6 +206,7 @@ class Calibration:
     notes: tuple[str, ...] = static(default=())
     probe: Probe | None = static(default=None)
     frame_size: tuple[int, int] | None = static(default=None)
+    pose_frames: tuple[str, str] | None = static(default=None)
 
     @property
     def converged(self) -> Bool[AnyArray, "*batch"]:
@@ -476,6 +478,7 @@ class Calibration:
             image_covariance=(
                 np.asarray(answer.unknowns_covariance)[rows[:, None], rows] if known else None
             ),
+            probe_frame=(self.pose_frames or ("Probe",))[0],
         )
 
     def plus_matrix(self) -> Float[np.ndarray, "4 4"]:

@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxcal import FormatError, InputError, __version__
 from jaxcal.io.atomic import atomic_path, write_text
-from jaxcal.io.frame_names import FramePair, check_frames, two_names
+from jaxcal.io.frame_names import FramePair, capitalised, probe_name, two_names
 from jaxcal.io.given_files import check_readable, naming, one_line, path_name, read_bytes
 from jaxcal.io.outputs import check_output
 from jaxcal.model.unknowns import TABLE, tangent_names
@@ -25,16 +25,18 @@ FORMAT = "jaxcal-calibration"
 VERSION = 1
 MAXIMUM_BYTES = 64 * 2**20
 
+_IN_THE_PLANE = ("scale_mm_per_px", "face_offset_mm", "range_factor")
+"""What takes an image point to the image plane; no part of the rigid transform."""
+
 _NPZ = (
     "image_plane_to_probe",
-    "scale_mm_per_px",
-    "face_offset_mm",
-    "range_factor",
+    *_IN_THE_PLANE,
     "covariance",
     "image_unknowns",
     "image_covariance",
     "rms_mm",
     "converged",
+    "date",
 )
 _NPZ_BYTES = 65536
 """Largest size of an ``.npz``, also unpacked."""
@@ -126,6 +128,7 @@ def save(
     chosen = check_target(path, format)
     if chosen != "json":
         transform.check_usable()
+    transform = replace(transform, date=transform.date or utc_now())
     if chosen in ("slicer", "itk"):
         from jaxcal.io.itk import write_itk
 
@@ -135,13 +138,12 @@ def save(
             if os.fspath(path).lower().endswith(".npz"):
                 known = {key: value for key, value in _record(transform).items() if key in _NPZ}
                 matrix = None if transform.scale_mm_per_px is None else transform.plus_matrix()
-                known["plus_image_to_probe"] = matrix
+                known |= {"plus_image_to_probe": matrix, "probe_frame": transform.probe_frame}
                 np.savez(file, **{k: v for k, v in known.items() if v is not None})
             else:
                 np.save(file, transform.plus_matrix())
     else:
-        dated = replace(transform, date=transform.date or utc_now())
-        write_text(path, text_of(dated, chosen, frames=frames))
+        write_text(path, text_of(transform, chosen, frames=frames))
 
 
 def text_of(transform: ImageTransform, format: SaveFormat, *, frames: FramePair) -> str:
@@ -168,7 +170,9 @@ def text_of(transform: ImageTransform, format: SaveFormat, *, frames: FramePair)
 
         # ROS's own frames are in lower case; the user's are written as they are.
         child, parent = (n.lower() if n in ("Image", "Probe") else n for n in two_names(frames))
-        return ros_yaml(transform.image_plane_to_probe, parent, child, left_out(transform, format))
+        held = {key: value for key, value in _record(transform).items() if key in _IN_THE_PLANE}
+        note = left_out(transform, format)
+        return ros_yaml(transform.image_plane_to_probe, parent, child, note, held)
     if format == "tusrec":
         from jaxcal.io.tus_rec import calib_matrix
 
@@ -194,6 +198,18 @@ def dated(record: dict[str, Any]) -> dict[str, Any]:
     Without them, equal calibrations have equal records.
     """
     return record | {"date": utc_now()}
+
+
+def renamed(transform: ImageTransform) -> str | None:
+    """That PLUS refuses the recording's name of the probe's frame, in words; else None."""
+    named = transform.probe_frame
+    written = probe_name(named)
+    if written == capitalised(named):
+        return None
+    return (
+        f"the recording calls the probe's frame {quoted(named)}, which PLUS refuses: written as "
+        f"{written} (another name: jaxcal export --probe-frame)"
+    )
 
 
 def left_out(transform: ImageTransform, format: SaveFormat) -> str | None:
@@ -253,7 +269,7 @@ def load_calibration(path: str | os.PathLike[str]) -> ImageTransform:
 
             found = read_transform(path)
             made = transform_from_plus_matrix(found.matrix, error_mm=found.error_mm, source=name)
-            return replace(made, probe_frame=probe_frame(found.target))
+            return replace(made, probe_frame=found.target)
         if lower.endswith((".tfm", ".txt", ".h5")):
             from jaxcal.io.itk import read_itk
 
@@ -267,7 +283,10 @@ def load_calibration(path: str | os.PathLike[str]) -> ImageTransform:
         if lower.endswith((".yaml", ".yml")):
             from jaxcal.io.ros import read_ros_yaml
 
-            return ImageTransform(read_ros_yaml(path), source=name)
+            matrix, held = read_ros_yaml(path)
+            record = {key: held.get(key) for key in _IN_THE_PLANE}
+            record |= {"version": VERSION, "image_plane_to_probe": matrix}
+            return transform_from_record(record, source=name)
         if lower.endswith(".npy"):
             return transform_from_plus_matrix(_load_npy(path), source=name)
         if lower.endswith(".npz"):
@@ -283,16 +302,30 @@ def stated_points(path: str | os.PathLike[str]) -> np.ndarray | None:
     Raises:
         FormatError: a ``.json`` that is no JSON object.
     """
-    if not path_name(path).lower().endswith(".json"):
-        return None
-    with naming(path):
-        stated = _json_object(path).get("tre")
+    stated = _stated(path, "tre")
     try:
         points = np.array([each["image"] for each in stated["points"]], dtype=np.float64)  # pyright: ignore[reportOptionalSubscript]
     except (TypeError, KeyError, ValueError, OverflowError):
         return None
     sound = points.ndim == 2 and points.shape[1] == 2 and np.isfinite(points).all()
     return points if sound else None
+
+
+def stated_source(path: str | os.PathLike[str]) -> str | None:
+    """The recording that a JSON of ours says it was made from; None if it does not.
+
+    Raises:
+        FormatError: a ``.json`` that is no JSON object.
+    """
+    stated = _stated(path, "source")
+    return stated if isinstance(stated, str) else None
+
+
+def _stated(path: str | os.PathLike[str], key: str) -> Any:
+    if not path_name(path).lower().endswith(".json"):
+        return None
+    with naming(path):
+        return _json_object(path).get(key)
 
 
 def _load_npy(path: str | os.PathLike[str]) -> np.ndarray:
@@ -317,6 +350,8 @@ def _load_npz(path: str | os.PathLike[str]) -> ImageTransform:
                 raise FormatError("holds more than a calibration")
         with np.load(path, allow_pickle=False) as file:
             record = {name: file[name].tolist() for name in _NPZ if name in file.files}
+            if "probe_frame" in file.files:
+                record["pose_frames"] = {"from": file["probe_frame"].tolist()}
     except FormatError:
         raise
     except Exception as error:
@@ -365,7 +400,8 @@ def transform_from_record(record: dict[str, Any], *, source: str = "memory") -> 
     offset = _array(record, "face_offset_mm", ())
     factor = _array(record, "range_factor", ())
     error = _array(record, "rms_mm", ())
-    date, named = record.get("date"), record.get("pose_frames")
+    date, frames = record.get("date"), record.get("pose_frames")
+    named = frames.get("from") if isinstance(frames, dict) else None
     if not (date is None or isinstance(date, str)):
         raise FormatError("date must be text")
     usable = usable and not record.get("wrong_frames")
@@ -383,16 +419,8 @@ def transform_from_record(record: dict[str, Any], *, source: str = "memory") -> 
         unknowns,
         _array(record, "image_covariance", (size, size)),
         date,
-        probe_frame(named.get("from") if isinstance(named, dict) else None),
+        named if isinstance(named, str) else "Probe",
     )
-
-
-def probe_frame(named: object) -> str:
-    """A name of the probe's frame as it is used; Probe if it is none, or one that PLUS refuses."""
-    try:
-        return check_frames(("Image", named))[1] if isinstance(named, str) else "Probe"
-    except InputError:
-        return "Probe"
 
 
 def _unknowns(record: dict[str, Any]) -> tuple[str, ...]:

@@ -26,7 +26,7 @@ import numpy as np
 from jaxcal import InputError
 from jaxcal.data.poses import check_affine, check_poses
 from jaxcal.data.recording import check_spacing_unit
-from jaxcal.io.frame_names import FramePair
+from jaxcal.io.frame_names import FramePair, probe_name
 from jaxcal.io.given_files import naming
 from jaxcal.model.image_points import point_jacobian
 from jaxcal.model.unknowns import TABLE, tangent_names
@@ -75,7 +75,8 @@ class ImageTransform:
         converged: whether the calibration can be used; None if unknown.
         source: the file, for messages.
         date: when the calibration was made, ISO 8601 with its time zone; None if unknown.
-        probe_frame: name of the probe's frame, for programs that name frames.
+        probe_frame: name of the probe's frame, for programs that name frames; ``Probe`` is written
+            for a name that PLUS refuses.
 
     Raises:
         InputError: wrong shapes, ``unknowns`` or ``date``; and, unless ``converged`` is False, NaN
@@ -330,7 +331,7 @@ class ImageTransform:
                 (``calib_matrix.csv``) or ``numpy`` (``.npy``: PLUS's matrix; ``.npz``: all). By
                 default that of the extension.
             frames: names of the image's and the probe's frame; by default Image and
-                ``probe_frame``.
+                ``probe_frame`` (Probe if PLUS refuses that).
 
         Raises:
             InputError: an extension of another or no format, an existing file of another kind, an
@@ -354,7 +355,7 @@ class ImageTransform:
         return saved.text_of(self, format, frames=self._frames(frames))
 
     def _frames(self, frames: FramePair | None) -> FramePair:
-        return ("Image", self.probe_frame) if frames is None else frames
+        return ("Image", probe_name(self.probe_frame)) if frames is None else frames
 
     def left_out(self, format: SaveFormat) -> str | None:
         """What a format cannot hold and its user must do, in words; None if it holds everything."""
