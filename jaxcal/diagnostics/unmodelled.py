@@ -20,7 +20,7 @@ f the kind's degrees of freedom after the fit. By Wilks it is chi squared if the
 exceed what chance exceeds once in a thousand recordings. That of a step is the largest of all
 places where the step may be. Its limit was found by simulation: Gaussian errors of equal size
 exceed 22 once in a thousand recordings, and errors that grow with depth 26 as often as they exceed
-the limit of a slip.
+the limit of a slip. An answer within bounds is first moved to the optimum of Gaussian offsets.
 
 A seventh, a distortion of the tracked positions, has a random field instead of few parameters
 (:mod:`jaxcal.diagnostics.tracker_distortion`). Its limit is from simulations with errors that grow
@@ -71,6 +71,8 @@ _BESIDE_STEP = 3
 """Least number of images before and after a step."""
 _ROUNDS = 8
 """Rounds of tuning the SDs with the further parameters."""
+_STEPS_TO_GAUSSIAN = 4
+"""Gauss-Newton steps from an answer within bounds to that of Gaussian offsets."""
 SIDE_MM = 20.0
 """The lateral position at which a curve is stated."""
 _WITHIN = (0, 2, 4)
@@ -131,22 +133,22 @@ class Unmodelled:
 def unmodelled(calibration: Calibration) -> list[Unmodelled]:
     """What the residuals of one calibration with concrete values show, the clearest first.
 
-    Only the joint method's fits of points with SDs are looked at.
+    Only fits of points with offsets are looked at.
     """
     used = np.asarray(calibration.mask) > 0
-    fits = calibration.method == "joint" and calibration.prior in TUNED
-    if calibration.problem is None or not fits or calibration.data != "points":
-        return []
-    if used.sum() < FEWEST:
+    fits = calibration.method != "conventional" and calibration.data == "points"
+    if calibration.problem is None or not fits or used.sum() < FEWEST:
         return []
     answer = map_arrays(lambda leaf: np.asarray(leaf)[None], calibration.numpy())
     seen = ImageErrors.of_answer(answer).centred(answer)
+    if calibration.prior not in TUNED:
+        seen = _at_gaussian_optimum(seen, used)
     columns = _columns(seen, used)
     rows = np.concatenate([seen.rows[0], *(each for _, _, each in columns)], axis=-1)[None]
     found: list[Unmodelled] = []
     unknowns = at = seen.rows.shape[-1]
     with np.errstate(all="ignore"):
-        whitened = Whitened.of(answer, replace(seen, rows=rows))
+        whitened = _whitened(answer, replace(seen, rows=rows))
         both = np.concatenate([whitened.rows, whitened.errors[..., None]], axis=-1)[0][used]
         # The triangle of each kind's rows and errors has the same sums of squares as all images.
         triangle = np.asarray(np.linalg.qr(np.swapaxes(both, 0, 1), mode="r"))
@@ -165,6 +167,23 @@ def unmodelled(calibration: Calibration) -> list[Unmodelled]:
                 found.append(replace(each, image=image))
         found += _distortion(answer, seen, used)
     return sorted(found, key=lambda each: -each.statistic / _BY_CHANCE[each.kind])
+
+
+def _whitened(answer: Calibration, seen: ImageErrors) -> Whitened | ImageErrors:
+    """Errors and rows in SDs; in mm for answers without SDs, which are tuned again anyway."""
+    return Whitened.of(answer, seen) if answer.prior in TUNED else seen
+
+
+def _at_gaussian_optimum(seen: ImageErrors, used: Bool[Array, " n"]) -> ImageErrors:
+    """The errors at the optimum of Gaussian offsets with tuned SDs, from an answer within bounds.
+
+    Offsets that are free within a bound absorb much of what the model leaves out, above all a step.
+    """
+    for _ in range(_STEPS_TO_GAUSSIAN):
+        _, step = _tuned(seen.errors[0][used], seen.rows[0][used], int(used.sum()))
+        unknowns = seen.unknowns.moved(step[None], seen.blocks)
+        seen = ImageErrors.of(unknowns, seen.problem, seen.blocks)
+    return seen
 
 
 def _columns(
@@ -247,8 +266,8 @@ def _distortion(
     positions = np.asarray(seen.problem.poses)[0, :, :3, 3]
     columns = tracker_distortion.columns(seen, used)
     rows = np.concatenate([seen.rows[0], columns], axis=-1)[None]
-    whitened = Whitened.of(answer, replace(seen, rows=rows))
-    start = float(np.mean(np.asarray(answer.sigma)[0, :2] ** 2))
+    whitened = _whitened(answer, replace(seen, rows=rows))
+    start = float(np.mean(seen.errors[0][used][:, :2] ** 2))
     errors, rows = whitened.errors[0][used], whitened.rows[0][used]
     found = tracker_distortion.fit(errors, rows, start)
     if found is None or not found.statistic > _BY_CHANCE["distortion"]:
