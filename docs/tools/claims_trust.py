@@ -267,6 +267,12 @@ claim(
         *_left_out("stated_good_and_wrong", "12"),
     ),
 )
+claim(
+    ACCURACY,
+    "The distortion is named in {:.1f} % of the recordings with 12 images, {:.1f} % with 30 and "
+    "{:.1f} % with 60.",
+    lambda: percent(column("unmodelled", "right", fault="distortion")),
+)
 
 
 # The bench.
