@@ -154,6 +154,16 @@ def test_fits_with_the_errors_of_a_tracker_are_looked_at_too(answers):
     assert "step" in {each.kind for each in unmodelled(replace(result, linearisation=tracked))}
 
 
+@pytest.mark.parametrize("asked", [{"prior": "bounded"}, {"method": "alternating"}])
+def test_offsets_free_within_a_bound_do_not_absorb_a_step(answers, asked):
+    spoilt, _ = answers["step"][0]
+    plain, _ = answers["clean 30"][0]
+    found, clear = (unmodelled(jaxcal.calibrate(each, **asked)) for each in (spoilt, plain))
+    assert found[0].kind == "step"
+    assert abs(found[0].image - 31) <= 2
+    assert clear == []
+
+
 def test_a_second_echo_in_forty_per_cent_of_the_images_is_told_of(answers):
     [(spoilt, plain)] = answers["echoes"]
     for result in (plain, jaxcal.calibrate(spoilt, prior="gaussian", robust=True)):

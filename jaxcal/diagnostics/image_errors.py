@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jaxcal.data.poses import rotations_from_vectors
 from jaxcal.model import unknowns as model
 from jaxcal.model.unknowns import (
     RIGID_UNKNOWNS,
@@ -27,6 +28,7 @@ from jaxcal.model.unknowns import (
     further_derivatives,
     split_further,
     step_between,
+    stepped,
     with_prior,
 )
 from jaxcal.runtime.array_types import AnyArray, Float
@@ -79,6 +81,20 @@ class Unknowns:
             further["scale"] = list(factors[:, None])
         x = np.asarray(found.image_to_probe)[None]
         return cls(x[:, :3, :3], x[:, :3, 3], np.asarray(found.point_mm)[None], further)
+
+    def moved(self, step: Float[Array, "k p"], blocks: Blocks) -> Unknowns:
+        """The unknowns after a step, in the order of ``blocks``."""
+        turn = rotations_from_vectors(step[:, 3:6])
+        along = (self.rotation @ step[:, :3, None])[..., 0]
+        further = {
+            name: [
+                stepped(name, value, by, np.exp)
+                for value, by in zip(values, step[:, block_slice(blocks, name)].T, strict=True)
+            ]
+            for name, values in self.further.items()
+        }
+        point = self.point + step[:, 6:RIGID_UNKNOWNS]
+        return Unknowns(self.rotation @ turn, self.translation + along, point, further)
 
     def along(self, axes: int) -> dict[str, list[Array]]:
         """Further unknowns with ``axes`` axes of length 1 after the leading one."""

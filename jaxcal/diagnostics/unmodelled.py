@@ -20,7 +20,7 @@ f the kind's degrees of freedom after the fit. By Wilks it is chi squared if the
 exceed what chance exceeds once in a thousand recordings. That of a step is the largest of all
 places where the step may be. Its limit was found by simulation: Gaussian errors of equal size
 exceed 22 once in a thousand recordings, and errors that grow with depth 26 as often as they exceed
-the limit of a slip.
+the limit of a slip. An answer within bounds is first moved to the optimum of Gaussian offsets.
 
 References: Wilks 1938; Andrews 1993 (a change at an unknown place).
 """
@@ -63,6 +63,8 @@ _BESIDE_STEP = 3
 """Least number of images before and after a step."""
 _ROUNDS = 8
 """Rounds of tuning the SDs with the further parameters."""
+_STEPS_TO_GAUSSIAN = 4
+"""Gauss-Newton steps from an answer within bounds to that of Gaussian offsets."""
 SIDE_MM = 20.0
 """The lateral position at which a curve is stated."""
 _WITHIN = (0, 2, 4)
@@ -122,22 +124,24 @@ class Unmodelled:
 def unmodelled(calibration: Calibration) -> list[Unmodelled]:
     """What the residuals of one calibration with concrete values show, the clearest first.
 
-    Only the joint method's fits of points with SDs are looked at.
+    Only fits of points with offsets are looked at.
     """
     used = np.asarray(calibration.mask) > 0
-    fits = calibration.method == "joint" and calibration.prior in TUNED
-    if calibration.problem is None or not fits or calibration.data != "points":
-        return []
-    if used.sum() < FEWEST:
+    fits = calibration.method != "conventional" and calibration.data == "points"
+    if calibration.problem is None or not fits or used.sum() < FEWEST:
         return []
     answer = map_arrays(lambda leaf: np.asarray(leaf)[None], calibration.numpy())
     seen = ImageErrors.of_answer(answer).centred(answer)
+    with_sds = calibration.prior in TUNED
+    if not with_sds:
+        seen = _at_gaussian_optimum(seen, used)
     columns = _columns(seen, used)
     rows = np.concatenate([seen.rows[0], *(each for _, _, each in columns)], axis=-1)[None]
     found: list[Unmodelled] = []
     unknowns = at = seen.rows.shape[-1]
     with np.errstate(all="ignore"):
-        whitened = Whitened.of(answer, replace(seen, rows=rows))
+        seen = replace(seen, rows=rows)
+        whitened = Whitened.of(answer, seen) if with_sds else seen
         both = np.concatenate([whitened.rows, whitened.errors[..., None]], axis=-1)[0][used]
         # The triangle of each kind's rows and errors has the same sums of squares as all images.
         triangle = np.asarray(np.linalg.qr(np.swapaxes(both, 0, 1), mode="r"))
@@ -155,6 +159,18 @@ def unmodelled(calibration: Calibration) -> list[Unmodelled]:
             if each is not None:
                 found.append(replace(each, image=image))
     return sorted(found, key=lambda each: -each.statistic / _BY_CHANCE[each.kind])
+
+
+def _at_gaussian_optimum(seen: ImageErrors, used: Bool[Array, " n"]) -> ImageErrors:
+    """The errors at the optimum of Gaussian offsets with tuned SDs, from an answer within bounds.
+
+    Offsets that are free within a bound absorb much of what the model leaves out, above all a step.
+    """
+    for _ in range(_STEPS_TO_GAUSSIAN):
+        _, step = _tuned(seen.errors[0][used], seen.rows[0][used], int(used.sum()))
+        unknowns = seen.unknowns.moved(step[None], seen.blocks)
+        seen = ImageErrors.of(unknowns, seen.problem, seen.blocks)
+    return seen
 
 
 def _columns(
