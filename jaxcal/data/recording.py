@@ -457,8 +457,10 @@ def checked_bound(
     Raises:
         InputError: what is no bound of a used image; the row is named.
     """
-    if max_elevation is not None and np.ndim(max_elevation) == 0:
-        max_elevation = np.full(count, real_array(max_elevation, "max_elevation"))
+    if max_elevation is not None:
+        max_elevation = real_array(max_elevation, "max_elevation")
+        if max_elevation.ndim == 0:
+            max_elevation = np.full(count, max_elevation)
     bound = _per_image("max_elevation", max_elevation, count, used, fill=1.0)
     if bound is not None:
         _refuse("max_elevation", bound < 0, "is negative")
