@@ -474,10 +474,12 @@ def check_values(problem: Problem) -> None:
         value = getattr(problem, name)
         if value is not None and not np.isfinite(np.asarray(value)):
             raise InputError(f"{name} of the problem must be finite")
-    if problem.sound_speed is not None:
+    if problem.sound_speed is not None and problem.sound_speed != WATER_M_S:
         check_sound_speed(float(np.asarray(problem.sound_speed)))
-    checked_covariance(problem.covariance, len(used), used)
-    checked_bound(problem.max_elevation, len(used), used)
+    if problem.covariance is not None:
+        checked_covariance(problem.covariance, len(used), used)
+    if problem.max_elevation is not None:
+        checked_bound(problem.max_elevation, len(used), used)
     channels = problem.channels
     if channels is not None:
         heard = used[:, None] & (np.asarray(channels.heard) > 0)
