@@ -6,9 +6,10 @@ do not average out as the covariance assumes. The position t of an image is take
 
     f(t) = sum_j phi_j(t) theta_j,    theta_j ~ N(0, s^2 I),
 
-with phi_j the linear and quadratic polynomials of the position (in SDs of all of them), and
-coefficients theta_j in R^3 of one common variance. (A constant moves the target only.) Orientations
-that are off in the same way move the target by smooth vectors as well, and are found with it.
+with phi_j the linear and quadratic polynomials of the position (the tracker's frame, mm, divided by
+the SD of all of them), and coefficients theta_j in R^3 of one common variance. (A constant moves
+the target only.) Orientations that are off in the same way move the target by smooth vectors as
+well, and are found with it.
 
 With e the whitened errors, J their derivatives by the unknowns and K those by theta, e + J d + K
 theta has the SDs of the three kinds of errors and s as parameters. The restricted likelihood is
@@ -54,7 +55,7 @@ def polynomials(positions: Float[Array, "n 3"], used: Bool[Array, " n"]) -> Floa
 
 
 def columns(seen: ImageErrors, used: Bool[Array, " n"]) -> Float[Array, "n 3 k"]:
-    """Derivatives K of one recording's errors by the coefficients.
+    """Derivatives K of one recording's errors (mm) by the coefficients (mm).
 
     Elevational errors do not count: the placement of the target may change with the pose as well.
     """
@@ -66,7 +67,7 @@ def columns(seen: ImageErrors, used: Bool[Array, " n"]) -> Float[Array, "n 3 k"]
 
 
 def size(positions: Float[Array, "n 3"], used: Bool[Array, " n"], variance: float) -> float:
-    """Root mean square distortion at the positions, mm, of coefficients with this variance."""
+    """Root mean square distortion at the positions, mm, for a variance s^2, mm^2."""
     squares = np.sum(polynomials(positions, used)[used] ** 2, axis=1)
     return float(np.sqrt(3 * variance * np.mean(squares)))
 
@@ -92,7 +93,7 @@ class Distortion:
     Attributes:
         statistic: twice the logarithm of the likelihood ratio.
         variance: s^2, mm^2.
-        response: R, by which the answer's unknowns follow the coefficients.
+        response: R, by which the answer's unknowns follow the coefficients, per mm.
     """
 
     statistic: float
