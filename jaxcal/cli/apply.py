@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from jaxcal import InputError
-from jaxcal.cli.common import NOT_NEGATIVE, ExitCode
+from jaxcal.cli.common import NOT_NEGATIVE, ExitCode, what_differs
 from jaxcal.cli.sequence_options import TABLES, with_options
 from jaxcal.runtime.messages import counted
 
@@ -60,7 +60,6 @@ def apply(
     """
     import numpy as np
 
-    from jaxcal.cli.compare import what_differs
     from jaxcal.io.atomic import write_text
     from jaxcal.io.outputs import begins_with, check_output
     from jaxcal.io.table import csv_text

@@ -21,10 +21,12 @@ import click
 from jaxcal import InputError
 
 if TYPE_CHECKING:
+    import numpy as np
     from rich.console import RenderableType
 
     from jaxcal.data.recording import Recording
     from jaxcal.io.target_search import FrameResults
+    from jaxcal.runtime.array_types import Float
 
 
 class ExitCode(enum.IntEnum):
@@ -46,12 +48,12 @@ class ExitCode(enum.IntEnum):
 
 
 class Number(click.ParamType):
-    """A finite number, positive (or, if asked for, zero)."""
+    """A finite number, positive (or, if asked for, zero), up to ``largest``."""
 
     name = "number"
 
-    def __init__(self, *, zero: bool = False) -> None:
-        self.zero = zero
+    def __init__(self, *, zero: bool = False, largest: float = math.inf) -> None:
+        self.zero, self.largest = zero, largest
 
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
@@ -61,9 +63,11 @@ class Number(click.ParamType):
             number = float(value)
         except ValueError:
             number = math.nan
-        if not math.isfinite(number) or number < 0 or (number == 0 and not self.zero):
+        good = math.isfinite(number) and 0 <= number <= self.largest
+        if not good or (number == 0 and not self.zero):
             wanted = "zero or a positive number" if self.zero else "a positive number"
-            self.fail(f"{value!r} is not {wanted}", param, ctx)
+            bound = "" if self.largest == math.inf else f" up to {self.largest:g}"
+            self.fail(f"{value!r} is not {wanted}{bound}", param, ctx)
         return number
 
 
@@ -89,6 +93,7 @@ class Server(click.ParamType):
 
 POSITIVE = Number()
 NOT_NEGATIVE = Number(zero=True)
+CONE = Number(zero=True, largest=85.0)
 
 json_option = click.option(
     "--json", "as_json", is_flag=True, help="Print one JSON object and nothing else."
@@ -118,6 +123,9 @@ def import_code(frames: FrameResults | None) -> ExitCode:
     lost = frames is not None and frames.most_lost
     return ExitCode.NOT_CONVERGED if lost else ExitCode.CONVERGED
 
+
+_OTHER_PIXELS = 1.02
+"""Ratio of two pixel sizes from which on the depth setting is likely to have changed."""
 
 WORDS = ("good", "fair", "uncertain")
 """Verdicts, best first."""
@@ -212,6 +220,39 @@ def segmented(recording: Recording) -> tuple[Recording, list[str]]:
     with naming(recording.source):
         points, found = segment_recording(recording)
     return points, list(found.warnings)
+
+
+def what_differs(
+    names: tuple[str, str],
+    sizes: tuple[Float[np.ndarray, " 2"] | None, Float[np.ndarray, " 2"] | None],
+    whose: tuple[str, str],
+) -> list[str]:
+    """What two calibrations, or one and a recording, should have in common and do not, in words.
+
+    Args:
+        names: of the probe's frame; Probe where none is known.
+        sizes: [lateral, axial] of a pixel, mm.
+        whose: what these are those of.
+    """
+    import numpy as np
+
+    from jaxcal.runtime.messages import quoted
+
+    words = []
+    if len({*names} - {"Probe"}) == 2:
+        words.append(
+            f"The frames of the probe have different names: {quoted(names[0])} in {whose[0]}, "
+            f"{quoted(names[1])} in {whose[1]}."
+        )
+    one, other = sizes
+    if one is None or other is None or (abs(np.log(one / other)) < np.log(_OTHER_PIXELS)).all():
+        return words
+    told = [f"{lateral:.4f} x {axial:.4f} mm" for lateral, axial in (one, other)]
+    return [
+        *words,
+        f"A pixel is {told[0]} in {whose[0]} and {told[1]} in {whose[1]}: were they taken at one "
+        "depth setting?",
+    ]
 
 
 @contextmanager

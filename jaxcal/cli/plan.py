@@ -10,8 +10,10 @@ import click
 
 from jaxcal import InputError
 from jaxcal.cli.common import (
+    CONE,
     POSITIVE,
     ExitCode,
+    Number,
     import_engine,
     json_option,
     prepare_jax,
@@ -94,16 +96,16 @@ _PICTURES = (
 )
 @click.option(
     "--cone",
-    type=click.FloatRange(0, 85),
+    type=CONE,
     metavar="DEG",
-    help="Largest tilt.  [default: 40; with REC that of its images, at least 30]",
+    help="Largest tilt, up to 85.  [default: 40; with REC that of its images, at least 30]",
 )
 @click.option(
     "--turn",
-    type=click.FloatRange(0, 180),
+    type=Number(zero=True, largest=180.0),
     metavar="DEG",
-    help="Largest turn about the beam's direction.  [default: 90; with REC that of its images, at "
-    "least 60]",
+    help="Largest turn about the beam's direction, up to 180.  [default: 90; with REC that of its "
+    "images, at least 60]",
 )
 @click.option(
     "--sigma",
