@@ -867,7 +867,8 @@ def test_images_are_added_to_a_recording(tmp_path, capsys):
     lines = table(NAMES, COLUMNS)
     (tmp_path / "all.csv").write_text("\n".join(lines))
     (tmp_path / "more.csv").write_text("\n".join([lines[0], *lines[5:]]))
-    for name, rows in (("all", lines), ("first", lines[:5]), ("second", [lines[0], *lines[3:]])):
+    later = table(NAMES, [PIXELS + 1, *COLUMNS[1:]])
+    for name, rows in (("all", lines), ("first", lines[:5]), ("second", [lines[0], *later[3:]])):
         (tmp_path / f"{name}.csv").write_text("\n".join(rows))
         assert main(["import", *(str(tmp_path / name) + end for end in (".csv", ".h5"))]) == 0
     first, more, second, out = (
@@ -887,6 +888,10 @@ def test_images_are_added_to_a_recording(tmp_path, capsys):
         return capsys.readouterr().err
 
     assert "is an input of this command" in refused(more, first, "--add-to", first)
+    # Images that are added twice would count twice.
+    assert "4 of its 4 images are in " in refused(first, out, "--add-to", first)
+    again = str(tmp_path / "all.csv")
+    assert "4 of its 6 images are in " in refused(again, out, "--add-to", first)
     assert "only --add-to goes with it" in refused(second, out, "--add-to", first, "--from", "A")
     sized = (more, out, "--add-to", first, "--spacing", "0.1", "0.1")
     assert "their pixels must be of one size" in refused(*sized)

@@ -214,6 +214,17 @@ def joined(first: Recording, second: Recording) -> Recording:
     )
 
 
+def shared_images(a: Images, b: Images) -> int:
+    """How many used images of one set are in the other, too: of one pose and one measurement."""
+
+    def told(images: Images) -> set[tuple[str, bytes]]:
+        rows = np.column_stack([images.poses.reshape(len(images), -1), images.measurements])
+        # Rotations that are read from a file are projected once more: their last digits differ.
+        return {(images.kind, row.tobytes()) for row in rows[images.mask].round(6) + 0.0}
+
+    return len(told(a) & told(b))
+
+
 def check_recording(value: object, name: str) -> None:
     """Raise InputError, which names the function, if what a caller gave is no recording."""
     if not isinstance(value, Recording):

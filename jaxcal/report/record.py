@@ -10,7 +10,7 @@ import numpy as np
 import jaxcal
 from jaxcal import InputError
 from jaxcal.data.poses import rotation_angle
-from jaxcal.data.recording import Images, Recording, Truth
+from jaxcal.data.recording import Images, Recording, Truth, shared_images
 from jaxcal.diagnostics.intervals import beside_scale
 from jaxcal.diagnostics.metrics import reconstruct, reconstruction_precision
 from jaxcal.diagnostics.misfits import noise_model
@@ -243,19 +243,12 @@ def check_test_images(recording: Recording, test: Recording | None = None) -> Im
             f"{source}: its poses are those of {quoted(other[0])}, not of {quoted(named[0])} as in "
             f"{recording.source} (import with --from)"
         )
-    shared = len(_poses_and_measurements(images) & _poses_and_measurements(recording.calibration))
-    if shared:
+    if shared := shared_images(images, recording.calibration):
         raise InputError(
             f"{source}: {shared} of {int(images.mask.sum())} test images are among the images to "
             "calibrate with: a test set is independent, recorded apart"
         )
     return images
-
-
-def _poses_and_measurements(images: Images) -> set[tuple[str, bytes]]:
-    """What tells an image from every other: the numbers of those that are used."""
-    rows = np.column_stack([images.poses.reshape(len(images), -1), images.measurements])
-    return {(images.kind, row.tobytes()) for row in rows[images.mask]}
 
 
 def plain(value: Any) -> Any:
