@@ -821,7 +821,13 @@ def test_import_calibrate_export(tmp_path, capsys):
     assert jaxcal.load_calibration(tmp_path / "again.json").probe_frame == "US_Probe"
     record = json.loads((tmp_path / "cal.json").read_text())
     assert record["exported"][0] == f"{config}: Image to US_Probe written"
-    assert record["exported"][-1] == f"{tmp_path / 'x.tfm'}: written"
+    assert record["exported"][-2:] == [
+        f"{tmp_path / 'x.tfm'}: written",
+        "- left out: SDs (.json and .npz hold them) and the name of the probe's frame, 'US_Probe'",
+    ]
+    for name, notes in (("all.npz", 0), ("t.npy", 1), ("t.json", 0)):
+        assert main(["export", str(tmp_path / "cal.json"), str(tmp_path / name)]) == 0
+        assert capsys.readouterr().out.count("- left out: SDs") == notes
     np.testing.assert_allclose(record["plus_image_to_probe"], found.plus_matrix(), atol=1e-12)
     # The error of X in its own frame, X Exp(d), against the stated covariance.
     error = np.linalg.inv(found.image_plane_to_probe) @ truth.image_plane_to_probe

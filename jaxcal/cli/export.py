@@ -177,7 +177,9 @@ def written(
 ) -> list[str]:
     """Write a transform; what was done and what should be known."""
     transform.save(path, format, frames=frames)
-    note = None if format is None else transform.left_out(format)
+    if format is None or path.lower().endswith(".npz"):
+        return [f"{path}: written"]
+    note = transform.left_out(format)
     return [f"{path}: written", *([] if note is None else [f"- {note}"])]
 
 
