@@ -205,8 +205,12 @@ def test_an_estimated_scale_replaces_the_written_one(result, recording, record):
     for written in (None, np.array([5.0, 5.0])):
         other = Recording(dataclasses.replace(test, spacing_mm=written))
         calibrated = dataclasses.replace(recording, calibration=measured)
-        precision = calibration_record(scaled, calibrated, other)["reconstruction_precision_mm"]
+        found = calibration_record(scaled, calibrated, other)
+        precision = found["reconstruction_precision_mm"]
         assert precision == pytest.approx(record["reconstruction_precision_mm"], rel=1e-9)
+        # Which other sizes the test images state is told.
+        told = "A pixel is 0.1000 x 0.2000 mm in the calibration and 5.0000 x 5.0000 mm in the test"
+        assert any(told in text for text in found["warnings"]) == (written is not None)
 
 
 def test_test_images_that_cannot_be_used_are_refused(recording):

@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from jaxcal import InputError
-from jaxcal.cli.common import NOT_NEGATIVE, ExitCode, what_differs
+from jaxcal.cli.common import NOT_NEGATIVE, ExitCode
 from jaxcal.cli.sequence_options import TABLES, with_options
 from jaxcal.runtime.messages import counted
 
@@ -63,6 +63,7 @@ def apply(
     from jaxcal.io.atomic import write_text
     from jaxcal.io.outputs import begins_with, check_output
     from jaxcal.io.table import csv_text
+    from jaxcal.report.differences import what_differs
     from jaxcal.result.saved import load_calibration
 
     if (source is None) == (not pixel):

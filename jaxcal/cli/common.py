@@ -21,12 +21,10 @@ import click
 from jaxcal import InputError
 
 if TYPE_CHECKING:
-    import numpy as np
     from rich.console import RenderableType
 
     from jaxcal.data.recording import Recording
     from jaxcal.io.target_search import FrameResults
-    from jaxcal.runtime.array_types import Float
 
 
 class ExitCode(enum.IntEnum):
@@ -124,9 +122,6 @@ def import_code(frames: FrameResults | None) -> ExitCode:
     return ExitCode.NOT_CONVERGED if lost else ExitCode.CONVERGED
 
 
-_OTHER_PIXELS = 1.02
-"""Ratio of two pixel sizes from which on the depth setting is likely to have changed."""
-
 WORDS = ("good", "fair", "uncertain")
 """Verdicts, best first."""
 REQUIRED = "fair"
@@ -220,39 +215,6 @@ def segmented(recording: Recording) -> tuple[Recording, list[str]]:
     with naming(recording.source):
         points, found = segment_recording(recording)
     return points, list(found.warnings)
-
-
-def what_differs(
-    names: tuple[str, str],
-    sizes: tuple[Float[np.ndarray, " 2"] | None, Float[np.ndarray, " 2"] | None],
-    whose: tuple[str, str],
-) -> list[str]:
-    """What two calibrations, or one and a recording, should have in common and do not, in words.
-
-    Args:
-        names: of the probe's frame; Probe where none is known.
-        sizes: [lateral, axial] of a pixel, mm.
-        whose: what these are those of.
-    """
-    import numpy as np
-
-    from jaxcal.runtime.messages import quoted
-
-    words = []
-    if len({*names} - {"Probe"}) == 2:
-        words.append(
-            f"The frames of the probe have different names: {quoted(names[0])} in {whose[0]}, "
-            f"{quoted(names[1])} in {whose[1]}."
-        )
-    one, other = sizes
-    if one is None or other is None or (abs(np.log(one / other)) < np.log(_OTHER_PIXELS)).all():
-        return words
-    told = [f"{lateral:.4f} x {axial:.4f} mm" for lateral, axial in (one, other)]
-    return [
-        *words,
-        f"A pixel is {told[0]} in {whose[0]} and {told[1]} in {whose[1]}: were they taken at one "
-        "depth setting?",
-    ]
 
 
 @contextmanager

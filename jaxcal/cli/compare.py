@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from jaxcal.cli.common import ExitCode, json_option, print_json, print_page, what_differs
+from jaxcal.cli.common import ExitCode, json_option, print_json, print_page
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -47,6 +47,7 @@ def compare(
 
     from jaxcal import InputError
     from jaxcal.diagnostics.comparison import compare_calibrations
+    from jaxcal.report.differences import what_differs
     from jaxcal.result.saved import load_calibration, stated_points, stated_source
     from jaxcal.runtime.messages import quoted
 

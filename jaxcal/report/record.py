@@ -27,6 +27,7 @@ from jaxcal.model.unknowns import (
 )
 from jaxcal.report.accuracy import accuracy_record, as_solved, settle
 from jaxcal.report.certified import certificate_record
+from jaxcal.report.differences import what_differs
 from jaxcal.result.calibration import Calibration
 from jaxcal.result.saved import FORMAT, VERSION
 from jaxcal.runtime.array_types import Float
@@ -164,6 +165,10 @@ def calibration_record(
         "warnings": result.warnings,
         **accuracy_record(result, solved, tre_points),
     }
+    if tested is not None:
+        sizes = None if scale is None else np.asarray(scale), tested.spacing_mm
+        whose = "the calibration", "the test images"
+        record["warnings"] = [*result.warnings, *what_differs(("Probe", "Probe"), sizes, whose)]
     if recording.truth is not None:
         record["truth_error"] = truth_error(answer, recording.truth)
     record |= {"source": recording.source, "convention": CONVENTION}
