@@ -821,6 +821,7 @@ def test_import_calibrate_export(tmp_path, capsys):
     assert jaxcal.load_calibration(tmp_path / "again.json").probe_frame == "US_Probe"
     record = json.loads((tmp_path / "cal.json").read_text())
     assert record["exported"][0] == f"{config}: Image to US_Probe written"
+    assert "- left out: SDs (.json and .npz hold them)" in record["exported"]
     assert record["exported"][-2:] == [
         f"{tmp_path / 'x.tfm'}: written",
         "- left out: SDs (.json and .npz hold them) and the name of the probe's frame, 'US_Probe'",

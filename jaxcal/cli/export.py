@@ -198,7 +198,8 @@ def patched(
         date=_made(transform),
     )
     written = f"{config if out is None else out}: {frames[0]} to {frames[1]} written"
-    return [written, *(f"- {note}" for note in notes)]
+    said = [*notes, transform.left_out("plus")]
+    return [written, *(f"- {note}" for note in said if note is not None)]
 
 
 def _made(transform: ImageTransform) -> datetime.datetime:
