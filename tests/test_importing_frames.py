@@ -9,6 +9,7 @@ import shlex
 import struct
 import warnings
 import zlib
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta, timezone
 from pathlib import Path
 
@@ -562,6 +563,14 @@ def test_poses_of_other_times(tmp_path, times, message):
     tracking = tracked(times, moving(MOMENTS))
     with pytest.raises(InputError, match=message):
         with_poses_by_time(images, tracking)
+
+
+def test_images_without_a_time_stamp_are_counted():
+    times = 100.3 + np.arange(COUNT) * 0.37
+    times[2] = np.nan
+    tracking = tracked(MOMENTS, moving(MOMENTS))
+    with pytest.raises(InputError, match=f"1 of {COUNT} images have no time stamp"):
+        with_poses_by_time(replace(tracking, time=times), tracking)
 
 
 @pytest.mark.parametrize(

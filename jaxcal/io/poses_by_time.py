@@ -70,9 +70,10 @@ def with_poses_by_time(
     """
     source = tracking.source
     ((pair, poses),) = tracking.transforms.items()
-    if not np.isfinite(images.time).all():
+    if untimed := int((~np.isfinite(images.time)).sum()):
         raise InputError(
-            f"{images.source}: has no times, so its poses cannot be looked up in {source}"
+            f"{images.source}: {untimed} of {len(images)} images have no time stamp, so their "
+            f"poses cannot be looked up in {source}"
         )
     kept = _increasing(tracking)
     time, poses, valid = tracking.time[kept], poses[kept], tracking.valid[pair][kept]
