@@ -9,7 +9,6 @@ import shlex
 import struct
 import warnings
 import zlib
-from dataclasses import replace
 from datetime import UTC, datetime, timedelta, timezone
 from pathlib import Path
 
@@ -570,7 +569,7 @@ def test_images_without_a_time_stamp_are_counted():
     times[2] = np.nan
     tracking = tracked(MOMENTS, moving(MOMENTS))
     with pytest.raises(InputError, match=f"1 of {COUNT} images have no time stamp"):
-        with_poses_by_time(replace(tracking, time=times), tracking)
+        with_poses_by_time(tracked(times, POSES), tracking)
 
 
 @pytest.mark.parametrize(
