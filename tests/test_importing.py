@@ -60,6 +60,7 @@ MATRIX = [f"m{i}{j}" for i in range(1, 4) for j in range(1, 5)]
     [
         table(NAMES, COLUMNS),
         table(["v", "u", *NAMES[2:]], [PIXELS[:, ::-1], TRANSLATIONS, QUATERNIONS]),
+        table(["", *NAMES], [np.arange(6), *COLUMNS]),
         table(NAMES, COLUMNS, ";", comma=True),
         table(NAMES, COLUMNS, "\t"),
         ["sep=;", *table(NAMES, COLUMNS, ";", comma=True)],
