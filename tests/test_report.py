@@ -184,6 +184,8 @@ def test_pixel_test_images_are_brought_to_mm(result, recording, record):
     assert converted["reconstruction_precision_mm"] == pytest.approx(
         record["reconstruction_precision_mm"], rel=1e-9
     )
+    assert "hold pixels, those to calibrate with points" in converted["warnings"][-1]
+    assert not any("those to calibrate with" in text for text in record["warnings"])
 
 
 def test_an_estimated_scale_replaces_the_written_one(result, recording, record):

@@ -169,6 +169,12 @@ def calibration_record(
         sizes = None if scale is None else np.asarray(scale), tested.spacing_mm
         whose = "the calibration", "the test images"
         record["warnings"] = [*result.warnings, *what_differs(("Probe", "Probe"), sizes, whose)]
+        if tested.kind != recording.calibration.kind:
+            record["warnings"].append(
+                f"The test images hold {tested.kind}s, those to calibrate with "
+                f"{recording.calibration.kind}s: do both count from one place? Pixels count from "
+                "the image's corner, points in mm mostly from the middle of the transducer."
+            )
     if recording.truth is not None:
         record["truth_error"] = truth_error(answer, recording.truth)
     record |= {"source": recording.source, "convention": CONVENTION}
