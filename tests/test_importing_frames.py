@@ -595,7 +595,9 @@ def test_times_of_poses_that_may_be_in_ms(tmp_path, named, unit, every, length, 
     (tmp_path / "t.csv").write_text("\n".join([f"{named},x,y,z,qx,qy,qz,qw", *rows]))
     options = ImportOptions(poses=tmp_path / "t.csv")
     if refused:
-        with pytest.raises(InputError, match=r"t\.csv: its poses last .* is its time in ms\?"):
+        with pytest.raises(
+            InputError, match=r"t\.csv: its poses last .* is its time in ms, us or ns\?"
+        ):
             open_sequence(tmp_path / "i.mha", options)
         return
     found, _ = open_sequence(tmp_path / "i.mha", options)

@@ -118,8 +118,8 @@ def _check_unit(
     if interval > of_images:
         raise InputError(
             f"{source}: its poses last {whole:.4g} s, one every {interval:.3g} s, the images "
-            f"{covered:.3g} s, one every {of_images:.3g} s: is its time in ms? State the unit in "
-            "the header: time [ms], or time [s]"
+            f"{covered:.3g} s, one every {of_images:.3g} s: is its time in ms, us or ns? State the "
+            "unit in the header: time [ms], [us], [ns], or [s]"
         )
 
 
