@@ -891,6 +891,12 @@ def test_images_are_added_to_a_recording(tmp_path, capsys):
     assert main(["import", second, out, "--add-to", first]) == 0
     assert len(jaxcal.load(out)) == 8
 
+    whole = jaxcal.load(first)
+    bounded = replace(whole.calibration, max_elevation=np.ones(4), amplitude=np.ones(4))
+    jaxcal.save(replace(whole, calibration=bounded), tmp_path / "bounded.h5")
+    assert main(["import", more, out, "--add-to", str(tmp_path / "bounded.h5")]) == 0
+    assert "- bounds on the offsets, amplitudes are left out" in capsys.readouterr().out
+
     def refused(*arguments: str) -> str:
         assert main(["import", *arguments]) == 2
         return capsys.readouterr().err
