@@ -237,6 +237,10 @@ def test_test_images_that_are_calibrated_with_are_refused(recording):
     images = recording.calibration
     with pytest.raises(InputError, match=r"r\.h5: 19 of 19 test images are among the images to"):
         check_test_images(recording, Recording(images, source="r.h5"))
+    # Files that were read and written again: those of import --add-to.
+    again = dataclasses.replace(images, poses=images.poses * (1 + 1e-15))
+    with pytest.raises(InputError, match="19 of 19 test images are among the images to"):
+        check_test_images(recording, Recording(again))
     half = dataclasses.replace(images, mask=np.arange(20) < 5)
     others = dataclasses.replace(images, mask=np.arange(20) > LEFT_OUT)
     assert check_test_images(Recording(half), Recording(others)) is others

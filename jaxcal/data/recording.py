@@ -225,9 +225,10 @@ def shared_images(a: Images, b: Images) -> int:
     """How many used images of one set are in the other, too: of one pose and one measurement."""
 
     def told(images: Images) -> set[tuple[str, bytes]]:
-        rows = np.column_stack([images.poses.reshape(len(images), -1), images.measurements])
         # Rotations that are read from a file are projected once more: their last digits differ.
-        return {(images.kind, row.tobytes()) for row in rows[images.mask].round(6) + 0.0}
+        poses = images.poses.reshape(len(images), -1).round(6) + 0.0
+        rows = np.column_stack([poses, images.measurements])
+        return {(images.kind, row.tobytes()) for row in rows[images.mask]}
 
     return len(told(a) & told(b))
 
