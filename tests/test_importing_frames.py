@@ -553,7 +553,7 @@ def tracked(times, poses) -> TrackedSequence:
         (np.full(200, np.nan), "states no times"),
         (np.full(200, 101.0), "one time stamp"),
         # Every image had a pose that was up to 0.1 s off, without a word.
-        (np.round(MOMENTS, 1), "159 of 200 poses have the time stamp of another pose"),
+        (np.round(MOMENTS, 1), "159 of 200 poses have the time stamp of the pose before"),
     ],
 )
 def test_poses_of_other_times(tmp_path, times, message):

@@ -154,8 +154,8 @@ def _increasing(tracking: TrackedSequence) -> Int[np.ndarray, " k"]:
     shared = int((moved & (time[good[1:]] == time[good[:-1]])).sum())
     if shared > _SHARED * len(good):
         raise InputError(
-            f"{source}: {shared} of {len(good)} poses have the time stamp of another pose, that "
-            "before: its times were written with too few digits, or poses were stamped in groups"
+            f"{source}: {shared} of {len(good)} poses have the time stamp of the pose before, but "
+            "differ from it: were times written with too few digits, or poses stamped in groups?"
         )
     return kept
 
