@@ -17,6 +17,7 @@ from rich.console import Console
 import jaxcal
 from jaxcal import design
 from jaxcal.calibration.resampling import relative_twist
+from jaxcal.cli import plan
 from jaxcal.cli.main import main
 from jaxcal.data.recording import Recording, make_images
 from jaxcal.diagnostics import influence as influences
@@ -38,7 +39,7 @@ from jaxcal.model.unknowns import (
     stepped,
 )
 from jaxcal.report.accuracy import FAIR_MM, GOOD_MM, region_of, settle
-from jaxcal.report.next_poses import next_poses_sentences
+from jaxcal.report.next_poses import next_poses_sentences, pose_records
 from jaxcal.report.record import _precision, calibration_record
 from jaxcal.report.summary import record_of, recording_of
 from jaxcal.report.tables import calibration_table
@@ -706,3 +707,19 @@ def test_exit_status_says_less_than_required(tmp_path, capfd):
     found = [json.loads(line) for line in capfd.readouterr().out.splitlines()]
     assert found[0]["verdict"] == "uncertain"
     assert codes == {"good": 5, "fair": 5, "uncertain": 0}
+
+
+def test_a_plan_says_where_in_the_frame_the_target_is_to_be(recording, result, capsys):
+    """In pixels: a machine shows no millimetres from the image's corner."""
+    candidates = design.candidates_around(recording, result, count=200)
+    found = design.next_poses(result, candidates, 2)
+    record = plan._record(found, "r.h5", candidates.constraints.region, result)
+    for pose in record["poses"]:
+        given = np.array([pose["target_px"]]), np.array([pose["pose"]])
+        placed = result.image_transform().apply(*given)
+        np.testing.assert_allclose(placed.points[0], result.point, atol=1e-6)
+    plan._print(found, record, None, None)
+    said = capsys.readouterr().out
+    assert "{:.0f}, {:.0f} ".format(*record["poses"][0]["target_px"]) in said
+    assert "(px)" in said
+    assert "target_px" not in pose_records(found)[0]

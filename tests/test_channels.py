@@ -137,6 +137,14 @@ def test_what_points_cannot_tell_is_said_or_refused():
         jaxcal.calibrate(jaxcal.Problem.from_recording(data), "conventional", data="channels")
 
 
+def test_a_face_offset_beside_times_is_refused():
+    """The channels ignored it, and the transform added it to ranges: points were 3 mm too deep."""
+    problem = jaxcal.Problem.from_recording(recording(STRAIGHT))
+    problem = replace(problem, face_offset=np.asarray(3.0))
+    with pytest.raises(InputError, match="face_offset_mm does not go with times of flight"):
+        jaxcal.calibrate(problem, data="channels")
+
+
 @pytest.mark.parametrize(
     ("method", "request_parts"),
     [

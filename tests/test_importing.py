@@ -60,6 +60,7 @@ MATRIX = [f"m{i}{j}" for i in range(1, 4) for j in range(1, 5)]
     [
         table(NAMES, COLUMNS),
         table(["v", "u", *NAMES[2:]], [PIXELS[:, ::-1], TRANSLATIONS, QUATERNIONS]),
+        table(["", *NAMES], [np.arange(6), *COLUMNS]),
         table(NAMES, COLUMNS, ";", comma=True),
         table(NAMES, COLUMNS, "\t"),
         ["sep=;", *table(NAMES, COLUMNS, ";", comma=True)],
@@ -821,7 +822,14 @@ def test_import_calibrate_export(tmp_path, capsys):
     assert jaxcal.load_calibration(tmp_path / "again.json").probe_frame == "US_Probe"
     record = json.loads((tmp_path / "cal.json").read_text())
     assert record["exported"][0] == f"{config}: Image to US_Probe written"
-    assert record["exported"][-1] == f"{tmp_path / 'x.tfm'}: written"
+    assert "- left out: SDs (.json and .npz hold them)" in record["exported"]
+    assert record["exported"][-2:] == [
+        f"{tmp_path / 'x.tfm'}: written",
+        "- left out: SDs (.json and .npz hold them) and the name of the probe's frame, 'US_Probe'",
+    ]
+    for name, notes in (("all.npz", 0), ("t.npy", 1), ("t.json", 0)):
+        assert main(["export", str(tmp_path / "cal.json"), str(tmp_path / name)]) == 0
+        assert capsys.readouterr().out.count("- left out: SDs") == notes
     np.testing.assert_allclose(record["plus_image_to_probe"], found.plus_matrix(), atol=1e-12)
     # The error of X in its own frame, X Exp(d), against the stated covariance.
     error = np.linalg.inv(found.image_plane_to_probe) @ truth.image_plane_to_probe
@@ -867,7 +875,8 @@ def test_images_are_added_to_a_recording(tmp_path, capsys):
     lines = table(NAMES, COLUMNS)
     (tmp_path / "all.csv").write_text("\n".join(lines))
     (tmp_path / "more.csv").write_text("\n".join([lines[0], *lines[5:]]))
-    for name, rows in (("all", lines), ("first", lines[:5]), ("second", [lines[0], *lines[3:]])):
+    later = table(NAMES, [PIXELS + 1, *COLUMNS[1:]])
+    for name, rows in (("all", lines), ("first", lines[:5]), ("second", [lines[0], *later[3:]])):
         (tmp_path / f"{name}.csv").write_text("\n".join(rows))
         assert main(["import", *(str(tmp_path / name) + end for end in (".csv", ".h5"))]) == 0
     first, more, second, out = (
@@ -882,11 +891,21 @@ def test_images_are_added_to_a_recording(tmp_path, capsys):
     assert main(["import", second, out, "--add-to", first]) == 0
     assert len(jaxcal.load(out)) == 8
 
+    whole = jaxcal.load(first)
+    bounded = replace(whole.calibration, max_elevation=np.ones(4), amplitude=np.ones(4))
+    jaxcal.save(replace(whole, calibration=bounded), tmp_path / "bounded.h5")
+    assert main(["import", more, out, "--add-to", str(tmp_path / "bounded.h5")]) == 0
+    assert "- bounds on the offsets, amplitudes are left out" in capsys.readouterr().out
+
     def refused(*arguments: str) -> str:
         assert main(["import", *arguments]) == 2
         return capsys.readouterr().err
 
     assert "is an input of this command" in refused(more, first, "--add-to", first)
+    # Images that are added twice would count twice.
+    assert "4 of its 4 images are in " in refused(first, out, "--add-to", first)
+    again = str(tmp_path / "all.csv")
+    assert "4 of its 6 images are in " in refused(again, out, "--add-to", first)
     assert "only --add-to goes with it" in refused(second, out, "--add-to", first, "--from", "A")
     sized = (more, out, "--add-to", first, "--spacing", "0.1", "0.1")
     assert "their pixels must be of one size" in refused(*sized)

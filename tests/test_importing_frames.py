@@ -552,6 +552,8 @@ def tracked(times, poses) -> TrackedSequence:
         (MOMENTS[::-1], "is before the one before it"),
         (np.full(200, np.nan), "states no times"),
         (np.full(200, 101.0), "one time stamp"),
+        # Every image had a pose that was up to 0.1 s off, without a word.
+        (np.round(MOMENTS, 1), "159 of 200 poses have the time stamp of the pose before"),
     ],
 )
 def test_poses_of_other_times(tmp_path, times, message):
@@ -560,6 +562,14 @@ def test_poses_of_other_times(tmp_path, times, message):
     tracking = tracked(times, moving(MOMENTS))
     with pytest.raises(InputError, match=message):
         with_poses_by_time(images, tracking)
+
+
+def test_images_without_a_time_stamp_are_counted():
+    times = 100.3 + np.arange(COUNT) * 0.37
+    times[2] = np.nan
+    tracking = tracked(MOMENTS, moving(MOMENTS))
+    with pytest.raises(InputError, match=f"1 of {COUNT} images have no time stamp"):
+        with_poses_by_time(tracked(times, POSES), tracking)
 
 
 @pytest.mark.parametrize(
@@ -585,7 +595,9 @@ def test_times_of_poses_that_may_be_in_ms(tmp_path, named, unit, every, length, 
     (tmp_path / "t.csv").write_text("\n".join([f"{named},x,y,z,qx,qy,qz,qw", *rows]))
     options = ImportOptions(poses=tmp_path / "t.csv")
     if refused:
-        with pytest.raises(InputError, match=r"t\.csv: its poses last .* is its time in ms\?"):
+        with pytest.raises(
+            InputError, match=r"t\.csv: its poses last .* is its time in ms, us or ns\?"
+        ):
             open_sequence(tmp_path / "i.mha", options)
         return
     found, _ = open_sequence(tmp_path / "i.mha", options)

@@ -184,6 +184,8 @@ def test_pixel_test_images_are_brought_to_mm(result, recording, record):
     assert converted["reconstruction_precision_mm"] == pytest.approx(
         record["reconstruction_precision_mm"], rel=1e-9
     )
+    assert "hold pixels, those to calibrate with points" in converted["warnings"][-1]
+    assert not any("those to calibrate with" in text for text in record["warnings"])
 
 
 def test_an_estimated_scale_replaces_the_written_one(result, recording, record):
@@ -205,8 +207,12 @@ def test_an_estimated_scale_replaces_the_written_one(result, recording, record):
     for written in (None, np.array([5.0, 5.0])):
         other = Recording(dataclasses.replace(test, spacing_mm=written))
         calibrated = dataclasses.replace(recording, calibration=measured)
-        precision = calibration_record(scaled, calibrated, other)["reconstruction_precision_mm"]
+        found = calibration_record(scaled, calibrated, other)
+        precision = found["reconstruction_precision_mm"]
         assert precision == pytest.approx(record["reconstruction_precision_mm"], rel=1e-9)
+        # Which other sizes the test images state is told.
+        told = "A pixel is 0.1000 x 0.2000 mm in the calibration and 5.0000 x 5.0000 mm in the test"
+        assert any(told in text for text in found["warnings"]) == (written is not None)
 
 
 def test_test_images_that_cannot_be_used_are_refused(recording):
@@ -231,6 +237,10 @@ def test_test_images_that_are_calibrated_with_are_refused(recording):
     images = recording.calibration
     with pytest.raises(InputError, match=r"r\.h5: 19 of 19 test images are among the images to"):
         check_test_images(recording, Recording(images, source="r.h5"))
+    # Files that were read and written again: those of import --add-to.
+    again = dataclasses.replace(images, poses=images.poses * (1 + 1e-15))
+    with pytest.raises(InputError, match="19 of 19 test images are among the images to"):
+        check_test_images(recording, Recording(again))
     half = dataclasses.replace(images, mask=np.arange(20) < 5)
     others = dataclasses.replace(images, mask=np.arange(20) > LEFT_OUT)
     assert check_test_images(Recording(half), Recording(others)) is others

@@ -60,10 +60,10 @@ def apply(
     """
     import numpy as np
 
-    from jaxcal.cli.compare import what_differs
     from jaxcal.io.atomic import write_text
     from jaxcal.io.outputs import begins_with, check_output
     from jaxcal.io.table import csv_text
+    from jaxcal.report.differences import what_differs
     from jaxcal.result.saved import load_calibration
 
     if (source is None) == (not pixel):

@@ -14,6 +14,7 @@ import click
 
 from jaxcal import InputError
 from jaxcal.cli.common import (
+    CONE,
     POSITIVE,
     REQUIRED,
     WORDS,
@@ -154,10 +155,11 @@ EXPORTS: tuple[SaveFormat, ...] = ("plus", "slicer", "itk", "ros", "tusrec", "nu
 )
 @click.option(
     "--cone",
-    type=click.FloatRange(0, 85),
+    type=CONE,
     metavar="DEG",
     help="Largest tilt of the poses that are advised, from the middle orientation of the images "
-    "(that of the images by default, at least 30), for a probe that cannot be tilted further.",
+    "(that of the images by default, at least 30), up to 85, for a probe that cannot be tilted "
+    "further.",
 )
 @click.option(
     "--require",

@@ -46,12 +46,12 @@ class ExitCode(enum.IntEnum):
 
 
 class Number(click.ParamType):
-    """A finite number, positive (or, if asked for, zero)."""
+    """A finite number, positive (or, if asked for, zero), up to ``largest``."""
 
     name = "number"
 
-    def __init__(self, *, zero: bool = False) -> None:
-        self.zero = zero
+    def __init__(self, *, zero: bool = False, largest: float = math.inf) -> None:
+        self.zero, self.largest = zero, largest
 
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
@@ -61,9 +61,11 @@ class Number(click.ParamType):
             number = float(value)
         except ValueError:
             number = math.nan
-        if not math.isfinite(number) or number < 0 or (number == 0 and not self.zero):
+        good = math.isfinite(number) and 0 <= number <= self.largest
+        if not good or (number == 0 and not self.zero):
             wanted = "zero or a positive number" if self.zero else "a positive number"
-            self.fail(f"{value!r} is not {wanted}", param, ctx)
+            bound = "" if self.largest == math.inf else f" up to {self.largest:g}"
+            self.fail(f"{value!r} is not {wanted}{bound}", param, ctx)
         return number
 
 
@@ -89,6 +91,7 @@ class Server(click.ParamType):
 
 POSITIVE = Number()
 NOT_NEGATIVE = Number(zero=True)
+CONE = Number(zero=True, largest=85.0)
 
 json_option = click.option(
     "--json", "as_json", is_flag=True, help="Print one JSON object and nothing else."

@@ -11,19 +11,15 @@ import click
 from jaxcal.cli.common import ExitCode, json_option, print_json, print_page
 
 if TYPE_CHECKING:
-    import numpy as np
     from rich.table import Table
 
     from jaxcal.diagnostics.comparison import Comparison
-    from jaxcal.runtime.array_types import Float
 
 MOST_FILES = 100
 """Most calibrations that are compared at once, each with each."""
 
 _SAME = 1e-3
 """Share of the expected distance (of 1 mm, if that is not known) below which two are the same."""
-_OTHER_PIXELS = 1.02
-"""Ratio of two pixel sizes from which on the depth setting is likely to have changed."""
 
 
 @click.command(short_help="Say whether calibrations of one probe agree.")
@@ -51,6 +47,7 @@ def compare(
 
     from jaxcal import InputError
     from jaxcal.diagnostics.comparison import compare_calibrations
+    from jaxcal.report.differences import what_differs
     from jaxcal.result.saved import load_calibration, stated_points, stated_source
     from jaxcal.runtime.messages import quoted
 
@@ -172,39 +169,6 @@ def _sentence(found: Comparison) -> str:
         f"The calibrations do not agree: {apart}. {limit} At least one is less accurate than it "
         "states, or the probe's marker or the geometry of its image changed in between."
     )
-
-
-def what_differs(
-    names: tuple[str, str],
-    sizes: tuple[Float[np.ndarray, " 2"] | None, Float[np.ndarray, " 2"] | None],
-    whose: tuple[str, str],
-) -> list[str]:
-    """What two calibrations, or one and a recording, should have in common and do not, in words.
-
-    Args:
-        names: of the probe's frame; Probe where none is known.
-        sizes: [lateral, axial] of a pixel, mm.
-        whose: what these are those of.
-    """
-    import numpy as np
-
-    from jaxcal.runtime.messages import quoted
-
-    words = []
-    if len({*names} - {"Probe"}) == 2:
-        words.append(
-            f"The frames of the probe have different names: {quoted(names[0])} in {whose[0]}, "
-            f"{quoted(names[1])} in {whose[1]}."
-        )
-    one, other = sizes
-    if one is None or other is None or (abs(np.log(one / other)) < np.log(_OTHER_PIXELS)).all():
-        return words
-    told = [f"{lateral:.4f} x {axial:.4f} mm" for lateral, axial in (one, other)]
-    return [
-        *words,
-        f"A pixel is {told[0]} in {whose[0]} and {told[1]} in {whose[1]}: were they taken at one "
-        "depth setting?",
-    ]
 
 
 def _summary(found: list[Comparison]) -> str:

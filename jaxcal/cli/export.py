@@ -177,7 +177,9 @@ def written(
 ) -> list[str]:
     """Write a transform; what was done and what should be known."""
     transform.save(path, format, frames=frames)
-    note = None if format is None else transform.left_out(format)
+    if format is None or path.lower().endswith(".npz"):
+        return [f"{path}: written"]
+    note = transform.left_out(format)
     return [f"{path}: written", *([] if note is None else [f"- {note}"])]
 
 
@@ -196,7 +198,8 @@ def patched(
         date=_made(transform),
     )
     written = f"{config if out is None else out}: {frames[0]} to {frames[1]} written"
-    return [written, *(f"- {note}" for note in notes)]
+    said = [*notes, transform.left_out("plus")]
+    return [written, *(f"- {note}" for note in said if note is not None)]
 
 
 def _made(transform: ImageTransform) -> datetime.datetime:

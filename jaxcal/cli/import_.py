@@ -50,7 +50,7 @@ def import_(sources: tuple[str, ...], out: str, add_to: str | None, **options: A
     docs/reference/formats.md says what each must hold.
     """
     _check(sources, out, add_to, options)
-    from jaxcal.data.recording import MINIMUM_IMAGES, joined
+    from jaxcal.data.recording import MINIMUM_IMAGES, OF_SOME, joined, shared_images
     from jaxcal.io.hdf5 import load, save
     from jaxcal.io.importing import import_files
     from jaxcal.io.sources import ImportOptions
@@ -69,9 +69,16 @@ def import_(sources: tuple[str, ...], out: str, add_to: str | None, **options: A
         save(recording, out, frames)
     else:
         added = len(recording)
+        if shared := shared_images(recording.calibration, first.calibration):
+            raise InputError(
+                f"{recording.source}: {shared} of its {added} images are in {add_to} already, and "
+                "an image counts once"
+            )
         notes = [f"{counted(added, 'image')} added to the {len(first)} of {add_to}", *notes]
-        if (first.calibration.covariance is None) != (recording.calibration.covariance is None):
-            notes.append("covariances of the points are left out: only some images have them")
+        pair = first.calibration, recording.calibration
+        held = [{name for name in OF_SOME if getattr(each, name) is not None} for each in pair]
+        if lost := [words for name, words in OF_SOME.items() if name in held[0] ^ held[1]]:
+            notes.append(f"{', '.join(lost)} are left out: only some images have them")
         recording = joined(first, recording)
         save(recording, out)
     images = recording.calibration

@@ -10,8 +10,10 @@ import click
 
 from jaxcal import InputError
 from jaxcal.cli.common import (
+    CONE,
     POSITIVE,
     ExitCode,
+    Number,
     import_engine,
     json_option,
     prepare_jax,
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
     from jaxcal.data.recording import Images
     from jaxcal.design import Candidates, Plan
     from jaxcal.design.constraints import Region
+    from jaxcal.result.calibration import Calibration
     from jaxcal.result.transform import ImageTransform
 
 _COUNTED = (0.5, 0.3, 0.2, 0.1)
@@ -94,16 +97,16 @@ _PICTURES = (
 )
 @click.option(
     "--cone",
-    type=click.FloatRange(0, 85),
+    type=CONE,
     metavar="DEG",
-    help="Largest tilt.  [default: 40; with REC that of its images, at least 30]",
+    help="Largest tilt, up to 85.  [default: 40; with REC that of its images, at least 30]",
 )
 @click.option(
     "--turn",
-    type=click.FloatRange(0, 180),
+    type=Number(zero=True, largest=180.0),
     metavar="DEG",
-    help="Largest turn about the beam's direction.  [default: 90; with REC that of its images, at "
-    "least 60]",
+    help="Largest turn about the beam's direction, up to 180.  [default: 90; with REC that of its "
+    "images, at least 60]",
 )
 @click.option(
     "--sigma",
@@ -182,7 +185,7 @@ def plan(
             found = plan_until(candidates, until_tre, criterion, result)
         if figure is not None:
             save_figure(design.plan_figure(found, until_tre), figure)
-        record = _record(found, recording, candidates.constraints.region)
+        record = _record(found, recording, candidates.constraints.region, result)
     if simulate:
         with progress("calibrating simulated recordings"):
             record["simulated"] = [
@@ -305,7 +308,9 @@ def _from_recording(
     return result, candidates
 
 
-def _record(found: Plan, recording: str | None, region: Region) -> dict[str, Any]:
+def _record(
+    found: Plan, recording: str | None, region: Region, result: Calibration | None
+) -> dict[str, Any]:
     from jaxcal.design import images_to
     from jaxcal.report.next_poses import pose_records
 
@@ -326,7 +331,7 @@ def _record(found: Plan, recording: str | None, region: Region) -> dict[str, Any
         "tre_mm": found.tre_mm.tolist(),
         "rp_mm": found.rp_mm.tolist(),
         "images_to_tre_mm": counted,
-        "poses": pose_records(found),
+        "poses": pose_records(found, result),
     }
 
 
@@ -337,12 +342,14 @@ def _print(
     from rich.table import Table
 
     table = Table(box=box.SIMPLE)
-    for heading in ("", "how to hold the probe", "lateral, depth\n(mm)", "error then\n(mm)"):
+    pixels = "target_px" in record["poses"][0]
+    where = "u, v\n(px)" if pixels else "lateral, depth\n(mm)"
+    for heading in ("", "how to hold the probe", where, "error then\n(mm)"):
         # Folded: a narrow terminal would cut off the ends of words.
         justify = "left" if "hold" in heading else "right"
         table.add_column(heading, justify=justify, overflow="fold")
     for k, pose in enumerate(record["poses"]):
-        lateral, depth = pose["target_mm"]
+        lateral, depth = pose["target_px" if pixels else "target_mm"]
         sign = " (fills space)" if pose["fills_space"] else ""
         table.add_row(
             str(found.known.images + k + 1),

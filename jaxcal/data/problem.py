@@ -482,6 +482,11 @@ def check_values(problem: Problem) -> None:
         checked_bound(problem.max_elevation, len(used), used)
     channels = problem.channels
     if channels is not None:
+        if np.asarray(problem.face_offset) != 0:
+            raise InputError(
+                "face_offset_mm does not go with times of flight, which count from the elements: "
+                "correct their delay_s, or leave the times out"
+            )
         heard = used[:, None] & (np.asarray(channels.heard) > 0)
         bad = (heard & ~np.isfinite(np.asarray(channels.distances))).any(axis=1)
         if bad.any():

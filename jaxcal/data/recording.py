@@ -39,6 +39,15 @@ Kind = Literal["point", "pixel", "time_of_flight"]
 _EXTENT_MM = 50.0
 """Of a target's path through the image where nothing better is known."""
 _AT_REST_MM = 1e-6
+OF_SOME = {
+    "covariance": "covariances of the points",
+    "max_elevation": "bounds on the offsets",
+    "time_of_flight": "times of flight",
+    "amplitude": "amplitudes",
+    "time": "time stamps",
+    "frame": "numbers of frames",
+}
+"""What :func:`joined` keeps only if both recordings have it, in words."""
 UNIT_OF: dict[Kind, str] = {"point": "mm", "pixel": "px", "time_of_flight": "s"}
 """Unit in which measurements of a kind are given."""
 
@@ -198,13 +207,11 @@ def joined(first: Recording, second: Recording) -> Recording:
         values = getattr(a, name), getattr(b, name)
         return None if any(value is None for value in values) else np.concatenate(values)
 
-    names = ("poses", "measurements", "mask", "covariance", "max_elevation", "amplitude")
-    names += ("time", "time_of_flight", "frame")
     return replace(
         first,
         calibration=replace(
             a,
-            **{name: both(name) for name in names},
+            **{name: both(name) for name in ("poses", "measurements", "mask", *OF_SOME)},
             frame_size=a.frame_size or b.frame_size,
         ),
         truth=None,
@@ -212,6 +219,18 @@ def joined(first: Recording, second: Recording) -> Recording:
         source=f"{first.source} with {second.source}",
         pose_frames=first.pose_frames or second.pose_frames,
     )
+
+
+def shared_images(a: Images, b: Images) -> int:
+    """How many used images of one set are in the other, too: of one pose and one measurement."""
+
+    def told(images: Images) -> set[tuple[str, bytes]]:
+        # Rotations that are read from a file are projected once more: their last digits differ.
+        poses = images.poses.reshape(len(images), -1).round(6) + 0.0
+        rows = np.column_stack([poses, images.measurements])
+        return {(images.kind, row.tobytes()) for row in rows[images.mask]}
+
+    return len(told(a) & told(b))
 
 
 def check_recording(value: object, name: str) -> None:

@@ -31,6 +31,8 @@ _INSIDE = 1e-9
 """Numbers outside by less than this, due to rounding, count as inside."""
 _LARGEST_MM = 5000
 """Nothing is seen so far away."""
+_LEAST_MM = 1
+"""Nothing is seen so near: depths of metres end before it."""
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
 Allowed = Callable[[Float[np.ndarray, "n 4 4"]], Bool[np.ndarray, " n"]]
@@ -74,9 +76,10 @@ class Region:
             value = getattr(self, name)
             if not (_are_in_order(value, (2,)) and np.isfinite(value).all()):
                 raise InputError(f"{name} of the region must be two mm in order, not {value!r}")
-        if not 0 < self.depth_mm[0] <= self.depth_mm[1] <= _LARGEST_MM:
+        if not (self.depth_mm[0] > 0 and _LEAST_MM <= self.depth_mm[1] <= _LARGEST_MM):
             raise InputError(
-                f"depths must be positive mm, up to {_LARGEST_MM}, not {self.depth_mm}"
+                f"depths must be positive mm, the far one {_LEAST_MM} to {_LARGEST_MM}, not "
+                f"{self.depth_mm}"
             )
         if max(map(abs, self.lateral_mm)) > _LARGEST_MM:
             raise InputError(

@@ -103,7 +103,8 @@ def columns_of_header(names: list[str], quaternion: QuaternionOrder | None) -> C
         role = _ROLE.get(base)
         if base == "q0" and len(numbered) == 1:
             role = "qw"
-        if role == "ignored":
+        # pandas and R write the numbers of the rows as a first column without a name.
+        if role == "ignored" or (index == 0 and not base):
             continue
         if role is None:
             rest.append(index)

@@ -23,6 +23,9 @@ LONGEST_GAP = 5.0
 """Longest time between two poses that is bridged, in median intervals."""
 _SHORT = 0.02
 """Images of less than this part of the tracking make one ask for the unit of its times."""
+_SHARED = 0.2
+"""Largest share of poses with the time stamp of another: it is that of stamps which are rounded to
+1.25 intervals between poses."""
 _ROUNDED_S = 1e-6
 """Times that were written as text and read again may be off by so much."""
 
@@ -67,11 +70,12 @@ def with_poses_by_time(
     """
     source = tracking.source
     ((pair, poses),) = tracking.transforms.items()
-    if not np.isfinite(images.time).all():
+    if untimed := int((~np.isfinite(images.time)).sum()):
         raise InputError(
-            f"{images.source}: has no times, so its poses cannot be looked up in {source}"
+            f"{images.source}: {untimed} of {len(images)} images have no time stamp, so their "
+            f"poses cannot be looked up in {source}"
         )
-    kept = _increasing(tracking.time, source)
+    kept = _increasing(tracking)
     time, poses, valid = tracking.time[kept], poses[kept], tracking.valid[pair][kept]
     interval = float(np.median(np.diff(time)))
     if not tracking.time_stated:
@@ -114,8 +118,8 @@ def _check_unit(
     if interval > of_images:
         raise InputError(
             f"{source}: its poses last {whole:.4g} s, one every {interval:.3g} s, the images "
-            f"{covered:.3g} s, one every {of_images:.3g} s: is its time in ms? State the unit in "
-            "the header: time [ms], or time [s]"
+            f"{covered:.3g} s, one every {of_images:.3g} s: is its time in ms, us or ns? State the "
+            "unit in the header: time [ms], [us], [ns], or [s]"
         )
 
 
@@ -127,8 +131,9 @@ def _within(asked: Float[np.ndarray, " n"], time: Float[np.ndarray, " m"]) -> np
     return np.where(np.abs(asked - nearest) <= _ROUNDED_S, nearest, asked)
 
 
-def _increasing(time: Float[np.ndarray, " m"], source: str) -> Int[np.ndarray, " k"]:
+def _increasing(tracking: TrackedSequence) -> Int[np.ndarray, " k"]:
     """The poses whose times are stated and later than the one before."""
+    source, time = tracking.source, tracking.time
     known = np.flatnonzero(np.isfinite(time))
     if len(known) < 2:
         raise InputError(f"{source}: states no times: its poses cannot be matched to the images")
@@ -143,6 +148,15 @@ def _increasing(time: Float[np.ndarray, " m"], source: str) -> Int[np.ndarray, "
     kept = known[np.concatenate([[True], steps > 0])]
     if len(kept) < 2:
         raise InputError(f"{source}: all its poses have one time stamp")
+    ((pair, poses),) = tracking.transforms.items()
+    good = known[tracking.valid[pair][known]]
+    moved = (poses[good[1:]] != poses[good[:-1]]).any(axis=(1, 2))
+    shared = int((moved & (time[good[1:]] == time[good[:-1]])).sum())
+    if shared > _SHARED * len(good):
+        raise InputError(
+            f"{source}: {shared} of {len(good)} poses have the time stamp of the pose before, but "
+            "differ from it: were times written with too few digits, or poses stamped in groups?"
+        )
     return kept
 
 
@@ -164,7 +178,7 @@ def lag_of_points(
             :func:`jaxcal.data.timing.estimate_latency`.
     """
     ((pair, poses),) = tracking.transforms.items()
-    kept = _increasing(tracking.time, tracking.source)
+    kept = _increasing(tracking)
     kept = kept[tracking.valid[pair][kept]]
     order = np.argsort(rows)
     try:

@@ -128,13 +128,9 @@ def _tre(
     names = ("middle", "near left", "near right", "far left", "far right")
     unit = np.array([[0.0, 0.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]])
     places = region.place(unit)[:, [0, 2]]
-    # The image's own unit: its size and the place of its origin, mm, [lateral, axial].
     transform = answer.image_transform()
     pixels = transform.scale_mm_per_px is not None
-    scale = np.ones(2) if transform.scale_mm_per_px is None else transform.scale_mm_per_px
-    scale = scale * [1.0, transform.range_factor]
-    origin = np.array([0.0, transform.face_offset_mm])
-    image = (places - origin) / scale
+    image = transform._image_points(places)
     given = real_array(wanted, "tre_points")
     if given.size:
         if given.ndim != 2 or given.shape[1] != 2:
@@ -143,7 +139,7 @@ def _tre(
             raise InputError(f"points of --tre must be numbers up to {LARGEST:g}")
         names += ("asked for",) * len(given)
         image = np.concatenate([image, given])
-        places = np.concatenate([places, given * scale + origin])
+        places = np.concatenate([places, transform._in_plane(given)[:, [0, 2]]])
     at = tre_at(answer, places)
     cells = region.grid(_ACROSS, _ACROSS).reshape(_ACROSS, _ACROSS, 3)[..., [0, 2]]
     mapped = tre_at(answer, cells)

@@ -31,7 +31,8 @@ def next_poses_record(
     Returns:
         ``tre_now_mm`` and ``tre_then_mm`` (predicted, root mean square over the image),
         ``images_to_half`` (how many would halve the error; None: over 1000) and ``poses``. Each
-        pose has ``words``, ``target_mm`` [lateral, axial], ``pose`` (4x4, probe -> tracker),
+        pose has ``words``, ``target_mm`` [lateral, axial] (and ``target_px`` [u, v] where the
+        images are in pixels), ``pose`` (4x4, probe -> tracker),
         ``fills_space`` and ``tre_mm``, the error with this pose and those before it.
     """
     if result.status == "failed" or result.wrong_frames is not None:
@@ -55,23 +56,28 @@ def next_poses_record(
         "tre_now_mm": float(plan.tre_mm[0]),
         "tre_then_mm": float(plan.tre_mm[-1]),
         "images_to_half": half,
-        "poses": pose_records(plan),
+        "poses": pose_records(plan, result),
     }
 
 
-def pose_records(plan: design.Plan) -> list[dict[str, Any]]:
-    """Each pose of a plan as plain values."""
+def pose_records(plan: design.Plan, result: Calibration | None = None) -> list[dict[str, Any]]:
+    """Each pose of a plan as plain values; targets in px, too, where ``result`` has pixels."""
     model, bounds = plan.candidates.model, plan.candidates.constraints
+    transform = None if result is None else result.image_transform()
+    targets, pixels = plan.targets[:, [0, 2]], None
+    if transform is not None and transform.scale_mm_per_px is not None:
+        pixels = transform._image_points(targets).tolist()
     return [
         {
             "words": design.pose_in_words(pose, bounds, model.image_to_probe, model.point),
-            "target_mm": [float(target[0]), float(target[2])],
+            "target_mm": target.tolist(),
+            **({} if pixels is None else {"target_px": pixels[k]}),
             "pose": pose.tolist(),
             "fills_space": bool(filling),
             "tre_mm": float(tre),
         }
-        for pose, target, filling, tre in zip(
-            plan.poses, plan.targets, plan.filling, plan.tre_mm[1:], strict=True
+        for k, (pose, target, filling, tre) in enumerate(
+            zip(plan.poses, targets, plan.filling, plan.tre_mm[1:], strict=True)
         )
     ]
 

@@ -10,7 +10,7 @@ import numpy as np
 import jaxcal
 from jaxcal import InputError
 from jaxcal.data.poses import rotation_angle
-from jaxcal.data.recording import Images, Recording, Truth
+from jaxcal.data.recording import Images, Recording, Truth, shared_images
 from jaxcal.diagnostics.intervals import beside_scale
 from jaxcal.diagnostics.metrics import reconstruct, reconstruction_precision
 from jaxcal.diagnostics.misfits import noise_model
@@ -27,6 +27,7 @@ from jaxcal.model.unknowns import (
 )
 from jaxcal.report.accuracy import accuracy_record, as_solved, settle
 from jaxcal.report.certified import certificate_record
+from jaxcal.report.differences import what_differs
 from jaxcal.result.calibration import Calibration
 from jaxcal.result.saved import FORMAT, VERSION
 from jaxcal.runtime.array_types import Float
@@ -164,6 +165,16 @@ def calibration_record(
         "warnings": result.warnings,
         **accuracy_record(result, solved, tre_points),
     }
+    if tested is not None:
+        sizes = None if scale is None else np.asarray(scale), tested.spacing_mm
+        whose = "the calibration", "the test images"
+        record["warnings"] = [*result.warnings, *what_differs(("Probe", "Probe"), sizes, whose)]
+        if tested.kind != recording.calibration.kind:
+            record["warnings"].append(
+                f"The test images hold {tested.kind}s, those to calibrate with "
+                f"{recording.calibration.kind}s: do both count from one place? Pixels count from "
+                "the image's corner, points in mm mostly from the middle of the transducer."
+            )
     if recording.truth is not None:
         record["truth_error"] = truth_error(answer, recording.truth)
     record |= {"source": recording.source, "convention": CONVENTION}
@@ -243,19 +254,12 @@ def check_test_images(recording: Recording, test: Recording | None = None) -> Im
             f"{source}: its poses are those of {quoted(other[0])}, not of {quoted(named[0])} as in "
             f"{recording.source} (import with --from)"
         )
-    shared = len(_poses_and_measurements(images) & _poses_and_measurements(recording.calibration))
-    if shared:
+    if shared := shared_images(images, recording.calibration):
         raise InputError(
             f"{source}: {shared} of {int(images.mask.sum())} test images are among the images to "
             "calibrate with: a test set is independent, recorded apart"
         )
     return images
-
-
-def _poses_and_measurements(images: Images) -> set[tuple[str, bytes]]:
-    """What tells an image from every other: the numbers of those that are used."""
-    rows = np.column_stack([images.poses.reshape(len(images), -1), images.measurements])
-    return {(images.kind, row.tobytes()) for row in rows[images.mask]}
 
 
 def plain(value: Any) -> Any:

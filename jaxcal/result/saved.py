@@ -171,7 +171,7 @@ def text_of(transform: ImageTransform, format: SaveFormat, *, frames: FramePair)
         # ROS's own frames are in lower case; the user's are written as they are.
         child, parent = (n.lower() if n in ("Image", "Probe") else n for n in two_names(frames))
         held = {key: value for key, value in _record(transform).items() if key in _IN_THE_PLANE}
-        note = left_out(transform, format)
+        note = _range_note(transform)
         return ros_yaml(transform.image_plane_to_probe, parent, child, note, held)
     if format == "tusrec":
         from jaxcal.io.tus_rec import calib_matrix
@@ -213,9 +213,18 @@ def renamed(transform: ImageTransform) -> str | None:
 
 
 def left_out(transform: ImageTransform, format: SaveFormat) -> str | None:
-    """What a format cannot hold and its user must do, in words; None where nothing is."""
-    if format != "ros":
-        return None
+    """What a format cannot hold, in words; None where nothing is. ``numpy`` is the .npy here."""
+    note = _range_note(transform) if format == "ros" else None
+    lost = []
+    if transform.covariance is not None and format != "json":
+        lost.append("SDs (.json and .npz hold them)")
+    if transform.probe_frame != "Probe" and format not in ("json", "plus", "ros"):
+        lost.append(f"the name of the probe's frame, {quoted(transform.probe_frame)}")
+    told = f"left out: {' and '.join(lost)}" if lost else None
+    return "; ".join(each for each in (note, told) if each is not None) or None
+
+
+def _range_note(transform: ImageTransform) -> str | None:
     from jaxcal.io.ros import range_note
 
     return range_note(transform.range_factor, transform.face_offset_mm, transform.scale_mm_per_px)

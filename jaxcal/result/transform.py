@@ -306,6 +306,10 @@ class ImageTransform:
         plane[:, [0, 2]] = self._mm_per_px() * measured + np.array([0.0, self.face_offset_mm])
         return plane
 
+    def _image_points(self, places: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+        """Image points, px or mm as measured, from [lateral, axial] in the image frame, mm."""
+        return (places - np.array([0.0, self.face_offset_mm])) / self._mm_per_px()
+
     def _scale(self) -> Float[np.ndarray, " 2"]:
         if self.scale_mm_per_px is None:
             raise InputError(
