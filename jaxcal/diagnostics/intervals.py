@@ -106,9 +106,9 @@ def variance_factor(calibration: Calibration) -> Float[AnyArray, "*batch"]:
     """The factor by which mean square errors exceed what the covariance says (traceable).
 
     It is 1 for a fit with equal weights, whose variances are estimated nearly without bias. SDs
-    that are tuned to the same images are also the weights of the fit. This makes the answer's error larger than with
-    known weights, and larger than the covariance says (Kackar and Harville 1984). Student's
-    variance corrects for both: see ``experiments/tre_calibration.py``.
+    that are tuned to the same images are also the weights of the fit. This makes the answer's error
+    larger than with known weights, and larger than the covariance says (Kackar and Harville 1984).
+    Student's variance corrects for both: see ``experiments/tre_calibration.py``.
     """
     xp = array_module(calibration)
     left = degrees_of_freedom(calibration)
