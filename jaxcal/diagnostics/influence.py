@@ -31,6 +31,7 @@ References: Cook 1977 (leaving out); MacKinnon and White 1985 (the residuals' co
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -109,16 +110,14 @@ class WhitenedErrors:
     variances: Float[Array, " k"]
 
     def covariances(
-        self, precision: Float[Array, " p"]
+        self, precision: Float[Array, " p"], invert: Callable[[Array], Array] = np.linalg.inv
     ) -> tuple[Float[Array, "p p"], Float[Array, "p p"]]:
         """S^-1 and the covariance of the unknowns, with the precision of their priors."""
-        by_error = np.einsum("mkp,mkq->kpq", self.rows, self.rows)
-        inverse = inverses((by_error.sum(axis=0) + np.diag(precision))[None], np.finfo(float).eps)[
-            0
-        ]
+        by_error, prior = np.einsum("mkp,mkq->kpq", self.rows, self.rows), np.diag(precision)
+        inverse = invert(by_error.sum(axis=0) + prior)
         if (self.variances == 1).all():
             return inverse, inverse
-        middle = np.einsum("k,kpq->pq", self.variances, by_error) + np.diag(precision)
+        middle = np.einsum("k,kpq->pq", self.variances, by_error) + prior
         return inverse, inverse @ middle @ inverse
 
 
@@ -160,7 +159,10 @@ def _influence(
     """Influence of whitened errors and a prior of this precision, from which the answer is away."""
     rows, errors = found.rows, found.errors
     components = rows.shape[1]
-    inverse, covariance = found.covariances(precision)
+    # NaN where the images do not determine all unknowns.
+    inverse, covariance = found.covariances(
+        precision, lambda matrix: inverses(matrix[None], np.finfo(float).eps)[0]
+    )
     if not at_minimum:
         # An answer averaged over laws, or an alternation that stopped early, does not minimise
         # these errors: take them at the minimum.
