@@ -10,9 +10,10 @@ from __future__ import annotations
 import os
 import sys
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 from jaxcal import InputError
 from jaxcal.data.probe import CurvilinearProbe
@@ -38,10 +39,6 @@ from jaxcal.runtime.arrays import (
 )
 from jaxcal.runtime.jax_modes import importing_jax, in_own_modes
 from jaxcal.runtime.messages import counted, shown
-
-if TYPE_CHECKING:
-    from jax.typing import DTypeLike
-
 
 _HOW = (
     "jaxcal.Problem.from_arrays(poses, measurements) makes one of arrays, jaxcal.load(path) reads "

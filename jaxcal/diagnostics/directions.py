@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from jaxcal import InputError
 from jaxcal.model.unknowns import TABLE, block_slice
+from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import AnyArray
 from jaxcal.runtime.arrays import finite_or_none
-
-if TYPE_CHECKING:
-    from jaxcal.result.calibration import Calibration
 
 WORTH = 0.7
 """A kind of further image is advised if it tells at least this share of what the best one tells."""

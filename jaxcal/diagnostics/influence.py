@@ -28,7 +28,7 @@ References: Cook 1977 (leaving out); MacKinnon and White 1985 (the residuals' co
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -43,12 +43,10 @@ from jaxcal.diagnostics.image_errors import (
 )
 from jaxcal.diagnostics.uncertainty import inverses
 from jaxcal.model.unknowns import predicted_distance
+from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Bool, Float, Int
 from jaxcal.runtime.arrays import map_arrays
 from jaxcal.solvers.plan import TUNED
-
-if TYPE_CHECKING:
-    from jaxcal.result.calibration import Calibration
 
 Array = np.ndarray
 

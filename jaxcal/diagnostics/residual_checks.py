@@ -22,8 +22,6 @@ normality; Gelman et al. 2013, chapter 6 (posterior predictive checks).
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from jaxcal.data.poses import rotations_from_vectors
@@ -39,12 +37,10 @@ from jaxcal.diagnostics.sd_by_place import relative_sd
 from jaxcal.diagnostics.uncertainty import Uncertainty, inverses
 from jaxcal.model.thresholds import CUT, FEW_IMAGES, FEWEST_IMAGES, MAD, RELATIVE_FLOOR
 from jaxcal.model.unknowns import block_slice, further_derivatives, measured
+from jaxcal.result.calibration import Calibration
 from jaxcal.result.findings import Inspection
 from jaxcal.runtime.array_types import AnyArray, Bool, Float
 from jaxcal.solvers.plan import TUNED
-
-if TYPE_CHECKING:
-    from jaxcal.result.calibration import Calibration
 
 Array = np.ndarray
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -11,11 +11,9 @@ from jaxcal import CalibrationError
 from jaxcal.diagnostics.image_errors import ImageErrors
 from jaxcal.diagnostics.residual_checks import inspect
 from jaxcal.diagnostics.uncertainty import assess
+from jaxcal.result.calibration import Calibration
 from jaxcal.result.findings import Summary
 from jaxcal.runtime.arrays import map_arrays
-
-if TYPE_CHECKING:
-    from jaxcal.result.calibration import Calibration
 
 Array = np.ndarray
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from jaxcal.diagnostics.directions import check_one, observability
@@ -11,10 +9,8 @@ from jaxcal.diagnostics.image_errors import KINDS
 from jaxcal.diagnostics.misfits import misfits
 from jaxcal.diagnostics.outliers import listed_outliers, outliers, suspects_in_words
 from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
+from jaxcal.result.calibration import Calibration
 from jaxcal.solvers.plan import TUNED
-
-if TYPE_CHECKING:
-    from jaxcal.result.calibration import Calibration
 
 IMPLAUSIBLE_RMS_MM = 10.0
 """Residuals with a larger root mean square do not come from a target within the beam."""

@@ -15,6 +15,7 @@ from jaxcal.data.probe import Probe
 from jaxcal.data.problem import Problem
 from jaxcal.model.distributions import OffsetLaw
 from jaxcal.model.unknowns import TABLE, Blocks, Values, block_slice, in_image, with_prior
+from jaxcal.result.findings import Inspection, Summary
 from jaxcal.result.saved import check_target, dated
 from jaxcal.result.transform import AppliedPoints, ImageTransform, SaveFormat
 from jaxcal.runtime.array_types import AnyArray, Bool, Float, Int
@@ -23,8 +24,6 @@ from jaxcal.solvers.convergence import Convergence
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from jaxcal.result.findings import Inspection, Summary
 
 
 class Status(enum.IntEnum):
