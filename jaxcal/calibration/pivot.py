@@ -28,6 +28,7 @@ from jaxcal.diagnostics.outliers import listed_outliers, outliers
 from jaxcal.diagnostics.uncertainty import LARGEST_SD, Spectra
 from jaxcal.model.parameters import Parameters, retract
 from jaxcal.model.residuals import target_in_image
+from jaxcal.model.thresholds import FEWEST_IMAGES, stands_out
 from jaxcal.result.calibration import Status
 from jaxcal.runtime import compiler, executables
 from jaxcal.runtime.arrays import first_images, is_traced
@@ -35,11 +36,9 @@ from jaxcal.runtime.given_values import check_flag, real_array
 from jaxcal.runtime.jax_modes import in_own_modes, inside_transformation, require_float64
 from jaxcal.solvers import dense
 from jaxcal.solvers.consensus import (
-    FEWEST_IMAGES,
     ConsensusModel,
     find_consensus,
     linearise,
-    stands_out,
     studentised_errors,
 )
 
@@ -108,6 +107,10 @@ class Pivot(eqx.Module):
         """SD along the least determined direction of tip and point, mm; NaN if it is not finite."""
         return self._weakest()[1]
 
+    def _check_one(self) -> None:
+        if np.ndim(self.status_code):
+            raise InputError("a batch holds many calibrations: look at one of them, or at arrays")
+
     def _weakest(self) -> tuple[np.ndarray, np.ndarray]:
         information, sigma = np.asarray(self.information), np.asarray(self.sigma)
         flat = information.reshape(-1, 6, 6)
@@ -121,8 +124,7 @@ class Pivot(eqx.Module):
         Raises:
             InputError: of a batch.
         """
-        if np.ndim(self.status_code):
-            raise InputError("a batch holds many calibrations: look at each one's rms")
+        self._check_one()
         if self.status == "failed" or not float(self.rms) > _LARGEST_RMS_MM:
             return None
         return (
@@ -138,8 +140,7 @@ class Pivot(eqx.Module):
         Raises:
             InputError: of a batch.
         """
-        if np.ndim(self.status_code):
-            raise InputError("a batch holds many calibrations, each with warnings of its own")
+        self._check_one()
         found = []
         if self.status == "failed":
             return ["the solve failed: its result holds no usable numbers"]
@@ -175,8 +176,7 @@ class Pivot(eqx.Module):
         """
         from jaxcal.report.pivot import pivot_record
 
-        if np.ndim(self.status_code):
-            raise InputError("a batch holds many calibrations, each with a record of its own")
+        self._check_one()
         return pivot_record(self)
 
     def __str__(self) -> str:

@@ -337,11 +337,14 @@ def stack(problems: list[Problem]) -> Problem:
         kept = [leaf.sharding for leaf in leaves if isinstance(leaf, jax.Array) and leaf.committed]
         return jax.device_put(np.stack(leaves), *kept[:1])
 
-    return jax.tree.map(stacked, *(_lengthened(problem, most) for problem in problems))
+    return jax.tree.map(stacked, *(lengthened(problem, most) for problem in problems))
 
 
-def _lengthened(problem: Problem, images: int) -> Problem:
-    """The problem with so many images; those added repeat the last one and are masked out."""
+def lengthened(problem: Problem, images: int) -> Problem:
+    """A problem or batch with so many images; those added repeat the last one and are masked out.
+
+    Concrete ones that are lengthened come back in numpy arrays.
+    """
     count = problem.images
     if count in (0, images):
         return problem

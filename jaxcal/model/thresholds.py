@@ -1,6 +1,9 @@
-"""Numbers on which solvers, answers and diagnostics have to agree. Needs no JAX."""
+"""Limits on which solvers, answers and diagnostics have to agree. Needs no JAX."""
 
 from __future__ import annotations
+
+from jaxcal.runtime.array_types import AnyArray, Bool, Float
+from jaxcal.runtime.arrays import array_module
 
 LARGEST_ELEVATION = 0.95
 """Offsets are kept below this fraction of the range: at 1 the circle's tangent turns axial."""
@@ -22,3 +25,18 @@ MAD = 1.4826
 
 RELATIVE_FLOOR = 0.02
 """No component's SD is taken to be less than this share of the largest."""
+
+
+def stands_out(
+    studentised: Float[AnyArray, "*batch n 3"], kept: Float[AnyArray, "*batch n"]
+) -> Bool[AnyArray, "*batch n"]:
+    """Whether an image's errors are larger than the images in use can explain (traceable).
+
+    A median of a dozen images is itself uncertain, so the limit is wider with few images. It is
+    not wider for an image that was left out: the prediction from few images is uncertain, too, and
+    an outlier that returned through the wide limit would bring the others back with it.
+    """
+    xp = array_module(studentised, kept)
+    count = xp.maximum(xp.sum(kept, axis=-1, keepdims=True), 1.0)
+    limit = CUT * xp.where(kept > 0, xp.sqrt(xp.maximum(FEW_IMAGES / count, 1.0)), 1.0)
+    return xp.any(xp.abs(studentised) > limit[..., None], axis=-1)
