@@ -26,10 +26,11 @@ from jaxcal.data.problem import Problem
 from jaxcal.data.recording import LEAST_REACH_MM, MINIMUM_IMAGES, MetresError
 from jaxcal.diagnostics.outliers import listed_outliers, outliers
 from jaxcal.diagnostics.uncertainty import LARGEST_SD, Spectra
+from jaxcal.model.outlying import stands_out
 from jaxcal.model.parameters import Parameters, retract
 from jaxcal.model.residuals import target_in_image
-from jaxcal.model.thresholds import FEWEST_IMAGES, stands_out
-from jaxcal.result.calibration import Status
+from jaxcal.model.thresholds import FEWEST_IMAGES
+from jaxcal.result.calibration import Status, check_one
 from jaxcal.runtime import compiler, executables
 from jaxcal.runtime.arrays import first_images, is_traced
 from jaxcal.runtime.given_values import check_flag, real_array
@@ -107,10 +108,6 @@ class Pivot(eqx.Module):
         """SD along the least determined direction of tip and point, mm; NaN if it is not finite."""
         return self._weakest()[1]
 
-    def _check_one(self) -> None:
-        if np.ndim(self.status_code):
-            raise InputError("a batch holds many calibrations: look at one of them, or at arrays")
-
     def _weakest(self) -> tuple[np.ndarray, np.ndarray]:
         information, sigma = np.asarray(self.information), np.asarray(self.sigma)
         flat = information.reshape(-1, 6, 6)
@@ -124,7 +121,7 @@ class Pivot(eqx.Module):
         Raises:
             InputError: of a batch.
         """
-        self._check_one()
+        check_one(self.status_code)
         if self.status == "failed" or not float(self.rms) > _LARGEST_RMS_MM:
             return None
         return (
@@ -140,7 +137,7 @@ class Pivot(eqx.Module):
         Raises:
             InputError: of a batch.
         """
-        self._check_one()
+        check_one(self.status_code)
         found = []
         if self.status == "failed":
             return ["the solve failed: its result holds no usable numbers"]
@@ -176,7 +173,7 @@ class Pivot(eqx.Module):
         """
         from jaxcal.report.pivot import pivot_record
 
-        self._check_one()
+        check_one(self.status_code)
         return pivot_record(self)
 
     def __str__(self) -> str:

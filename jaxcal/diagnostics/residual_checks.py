@@ -35,7 +35,8 @@ from jaxcal.diagnostics.image_errors import (
 )
 from jaxcal.diagnostics.sd_by_place import relative_sd
 from jaxcal.diagnostics.uncertainty import Uncertainty, inverses
-from jaxcal.model.thresholds import FEWEST_IMAGES, MAD, RELATIVE_FLOOR, stands_out
+from jaxcal.model.outlying import stands_out
+from jaxcal.model.thresholds import FEWEST_IMAGES, MAD, RELATIVE_FLOOR
 from jaxcal.model.unknowns import block_slice, further_derivatives, measured
 from jaxcal.result.calibration import Calibration
 from jaxcal.result.findings import Inspection

@@ -406,8 +406,7 @@ class Calibration:
         """
         from jaxcal.diagnostics.frame_checks import wrong_frames
 
-        if self._concrete(self.mask).ndim != 1:
-            raise InputError("a batch holds many calibrations: take one of them, batch[0]")
+        check_one(self._concrete(self.status_code))
         if self.problem is None:
             return None
         return wrong_frames(replace(self.problem, mask=self.mask), self.blocks)
@@ -458,8 +457,7 @@ class Calibration:
         from jaxcal.diagnostics.intervals import range_of_row_zero
 
         answer = self.numpy()
-        if answer.image_to_probe.ndim != 2:
-            raise InputError("a batch holds many transforms: take one of its calibrations")
+        check_one(answer.status_code)
         scale = answer.scale_mm_per_px
         known = np.isfinite(answer.unknowns_covariance).all()
         origin, factor = range_of_row_zero(answer)
@@ -612,3 +610,23 @@ class Calibration:
                 "use the arrays (status_code, converged, ...) there, and the rest outside"
             )
         return np.asarray(value)
+
+
+def check_one(status_code: Int[AnyArray, "*batch"]) -> None:
+    """Raise InputError where each calibration of a batch has a status."""
+    if np.ndim(status_code):
+        raise InputError("a batch holds many calibrations: take one of them, batch[0]")
+
+
+def data_of(calibration: Calibration) -> Problem:
+    """The data that were solved.
+
+    Raises:
+        CalibrationError: they are not held.
+    """
+    if calibration.problem is None:
+        raise CalibrationError(
+            "this needs the data, and this calibration does not hold its problem: add it with "
+            "calibration.with_problem(problem)"
+        )
+    return calibration.problem

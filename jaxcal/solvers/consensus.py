@@ -39,9 +39,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxcal.data.problem import Problem
+from jaxcal.model.outlying import stands_out
 from jaxcal.model.parameters import Parameters, retract
 from jaxcal.model.residuals import measured_points, measurement_residual
-from jaxcal.model.thresholds import FEWEST_IMAGES, MAD, RELATIVE_FLOOR, stands_out
+from jaxcal.model.thresholds import FEWEST_IMAGES, MAD, RELATIVE_FLOOR
 from jaxcal.model.unknowns import Blocks, count_unknowns
 from jaxcal.solvers import dense
 from jaxcal.solvers.proposals import SUBSET, linear_proposals, nominal, subset_weights
