@@ -29,7 +29,7 @@ from jaxcal.calibration.resampling import relative_twist
 from jaxcal.calibration.serial_correlation import _cosine_transform, _covariances, widened
 from jaxcal.data.problem import Channels
 from jaxcal.data.recording import make_images
-from jaxcal.diagnostics.influence import influence_of, whitened_errors
+from jaxcal.diagnostics.influence import WhitenedErrors, influence_of, whitened_errors
 from jaxcal.report.accuracy import GOOD_MM
 from jaxcal.report.record import calibration_record, further_unknowns
 
@@ -184,6 +184,12 @@ def test_correlation_time(frames, alike):
     assert np.median(times) == pytest.approx(2 * alike, rel=0.25)
 
 
+def whitened(errors: np.ndarray, rows: np.ndarray) -> WhitenedErrors:
+    """Lateral, range and elevational errors in their own SDs."""
+    every = np.ones(len(rows))
+    return WhitenedErrors(errors, rows, np.arange(3), 0 * every, every > 0, len(rows), np.ones(3))
+
+
 def _linear_answers(order, correlation: float, share: float = 1.0):
     """Errors of answers from 40 images on a slow path, in their SDs, and how these were widened.
 
@@ -201,7 +207,7 @@ def _linear_answers(order, correlation: float, share: float = 1.0):
         drawn = np.sqrt(share) * drift + np.sqrt(1 - share) * own
         inverse = np.linalg.inv(np.einsum("mkp,mkq->pq", rows, rows))
         moved = inverse @ np.einsum("mkp,mk->p", rows, drawn)
-        before, after = _covariances(drawn - rows @ moved, rows, np.zeros(6))
+        before, after = _covariances(whitened(drawn - rows @ moved, rows), np.zeros(6))
         np.testing.assert_allclose(before, inverse, rtol=1e-9)
         errors.append(moved / np.sqrt(np.diag(after)))
         widening.append(np.sqrt(np.diag(after) / np.diag(before)))
@@ -306,8 +312,8 @@ def correlated(frames):
     problem = jaxcal.Problem.from_arrays(made.poses[::30], made.points[::30])
     wide = jaxcal.calibrate(problem, "conventional", estimate="sound-speed")
     assert not wide.notes
-    rows = whitened_errors(jax.tree.map(lambda leaf: np.asarray(leaf)[None], wide)).rows
-    plain = np.linalg.inv(np.einsum("mkp,mkq->pq", rows, rows))
+    errors = whitened_errors(jax.tree.map(lambda leaf: np.asarray(leaf)[None], wide))
+    plain = errors.covariances(np.zeros(10))[1]
     assert np.trace(wide.covariance) > 1.2 * np.trace(plain[:6, :6])
     return wide, plain
 
@@ -362,7 +368,7 @@ def test_alike_errors_leave_a_prior_as_it_is():
     rows[..., 4] = rows[..., 3]
     rows[1:] = 0.9 * rows[:-1].cumsum(axis=0) / np.arange(1, 40)[:, None, None] + 0.1 * rows[1:]
     slow = np.cumsum(rng.normal(size=(40, 3)), axis=0)
-    before, after = _covariances(slow, rows, np.array([0.0, 0.0, 0.0, 0.0, 1e-4]))
+    before, after = _covariances(whitened(slow, rows), np.array([0.0, 0.0, 0.0, 0.0, 1e-4]))
     assert before[4, 4] == pytest.approx(1e4)
     assert after[4, 4] == pytest.approx(1e4)
     assert after[0, 0] > 1.5 * before[0, 0]

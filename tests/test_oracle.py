@@ -152,10 +152,11 @@ def test_conventional(name, row):
     data = data_of(name, row)
     fit = conventional(name, row)
     spread = uncertainty.residual_variance(fit.cost, len(data), 9)
-    independent = uncertainty.covariance(fit.jacobian, 9, spread)
-    along = fit.jacobian.reshape(len(data), 3, 9).swapaxes(0, 1) / np.sqrt(spread)
-    errors = fit.residual.reshape(len(data), 3).T / np.sqrt(spread)
-    wider = correlation.widened(independent, along, errors)
+    by_image, residual = fit.jacobian.reshape(len(data), 3, 9), fit.residual.reshape(-1, 3)
+    variances = uncertainty.axis_variances(by_image, residual, spread)
+    independent = uncertainty.covariance_by_axis(by_image, variances)
+    along, errors = by_image.swapaxes(0, 1) / np.sqrt(spread), residual.T / np.sqrt(spread)
+    wider = correlation.widened(independent, along, errors, variances / spread)
     for road, answer in answers(name, "conventional", row).items():
         covariance = wider if road == "one" else independent
         information = np.linalg.cholesky(spread * np.linalg.inv(covariance)).T

@@ -111,10 +111,10 @@ def tre_span(name: str) -> tuple[float, float]:
     return span(column("tre_calibration", name, elevation_distribution=centred))
 
 
-def covered(**where: str) -> tuple[float, ...]:
+def covered(which: str = "coverage", **where: str) -> tuple[float, ...]:
     """Least and largest coverage of X's six parameters, %."""
-    names = [name for name in table("coverage")[0] if name.startswith("cover_")]
-    return tuple(percent(span(v for name in names for v in column("coverage", name, **where))))
+    names = [name for name in table(which)[0] if name.startswith("cover_")]
+    return tuple(percent(span(v for name in names for v in column(which, name, **where))))
 
 
 def auto() -> list[float]:

@@ -217,6 +217,15 @@ claim(
 )
 claim(
     ACCURACY,
+    "Those of the conventional method cover it in {:.1f} to {:.1f} % of the same trials, and its "
+    "predicted error is {:.2f} to {:.2f} times the actual one.",
+    lambda: (
+        *covered("coverage_conventional"),
+        *span(column("coverage_conventional", "predicted_over_actual")),
+    ),
+)
+claim(
+    ACCURACY,
     "csv)): {:.0f} recordings of {:.0f} images a condition, offsets of {:g} and "
     "{:g} mm, {:g} mm of noise.",
     lambda: (

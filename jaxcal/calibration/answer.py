@@ -6,7 +6,8 @@ the problem and two p x p matrices:
 
 - S, the *information* of the shared unknowns: the normal matrix of the whitened residuals with the
   offsets eliminated. Its inverse, times the residuals' variance where they are in mm, is the
-  covariance (the Cramer-Rao bound, where no offset rests on its bound).
+  covariance (the Cramer-Rao bound, where no offset rests on its bound). The conventional method's
+  has a variance for each axis (:func:`jaxcal.diagnostics.uncertainty.information_by_axis`).
 - D, the *design*: the normal matrix of the unweighted residuals with the offsets known.
 
 The status needs no spectrum. Rotations, scales and sound speed are multiplied by the lever arm L,
@@ -25,11 +26,18 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxcal.data.problem import Problem
 from jaxcal.data.recording import MINIMUM_IMAGES
-from jaxcal.diagnostics.uncertainty import AT_BOUND, LARGEST_SD, mm_at_target, threshold
+from jaxcal.diagnostics.uncertainty import (
+    AT_BOUND,
+    LARGEST_SD,
+    information_by_axis,
+    mm_at_target,
+    threshold,
+)
 from jaxcal.model.batch import ImagePlanes, Iterate, barrier, targets
 from jaxcal.model.observations import (
     BoundedOffsets,
     FurtherUnknowns,
+    InPlane,
     LocalUnknown,
     local_unknowns,
 )
@@ -166,6 +174,14 @@ def _normal_matrices(
     """S and D at a solution."""
     observation, iterate = found.observation, found.iterate
     geometry = observation.geometry(images, iterate.blocks)
+    if isinstance(observation, InPlane):
+        sums = component_sums(iterate, observation.by_axis(), images, None)
+        parts = jax.vmap(stacked)(sums.matrix)
+        design = jnp.sum(parts, axis=0)
+        lever = Errors.of(iterate, images).lever()
+        information = information_by_axis(parts, sums.squares, images.used, lever, _ridged_inverse)
+        # Where the poses determine nothing, the design alone tells.
+        return jnp.where(jnp.isfinite(information), information, design), design
     if geometry is observation and observation.whitened:
         sums = component_sums(iterate, observation, images, None, found.medium)
         return sums.weighted(1 / observation.sigma**2).stacked(), stacked(jnp.sum(sums.matrix, 0))
@@ -173,6 +189,12 @@ def _normal_matrices(
     if geometry is observation:
         return weighted, weighted
     return weighted, accumulate(iterate, geometry, images, None).stacked()
+
+
+def _ridged_inverse(matrix: Float[Array, "p p batch"]) -> Float[Array, "p p batch"]:
+    """Inverses of symmetric matrices with a ridge at the level of rounding."""
+    eye = jnp.eye(len(matrix), dtype=matrix.dtype)[..., None]
+    return inverse_batch_last(matrix * (1 + 16 * jnp.finfo(matrix.dtype).eps * eye))[0]
 
 
 class Errors(eqx.Module):

@@ -18,7 +18,14 @@ import numpy as np
 
 from jaxcal.data.problem import Problem
 from jaxcal.diagnostics.image_errors import ImageErrors
-from jaxcal.diagnostics.uncertainty import LARGEST_SD, inverses, mm_at_target, threshold
+from jaxcal.diagnostics.uncertainty import (
+    LARGEST_SD,
+    information_by_axis,
+    inverses,
+    mm_at_target,
+    rounding,
+    threshold,
+)
 from jaxcal.model.unknowns import FURTHER, count_unknowns, split_further
 from jaxcal.result.calibration import Calibration, Linearisation, Medium, Status
 from jaxcal.runtime.arrays import map_arrays
@@ -59,19 +66,26 @@ def _with_uncertainty(found: ClosedForm, problem: Problem, plan: SolvePlan) -> C
     seen = ImageErrors.of_closed_form(found, problem, blocks)
     plane = np.zeros_like(seen.mask)
     residual, axial = seen.from_circle(plane)
-    rows = seen.circle_rows(axial).reshape(-1, count_unknowns(blocks))
-    errors = residual.ravel()
-    information = rows.T @ rows
-    used = float(seen.mask.sum())
+    each = seen.circle_rows(axial)[0]
+    rows, errors = each.reshape(-1, count_unknowns(blocks)), residual.ravel()
+    design = rows.T @ rows
+    used, lever = np.asarray(seen.mask.sum()), seen.lever(seen.mask)
     objective = float(errors @ errors)
     variance = objective / max(3 * used - count_unknowns(blocks), 1.0)
 
     # As in jaxcal.calibration.answer: which directions are known, in mm at the target.
-    lever = seen.lever(seen.mask)
-    scaled = information / np.outer(*[mm_at_target(lever, blocks)[0]] * 2)
-    values = np.linalg.eigvalsh(scaled)
+    scale = np.outer(*[mm_at_target(lever, blocks)[0]] * 2)
+    values = np.linalg.eigvalsh(design / scale)
     if values[0] <= threshold(eps) * values.sum():
         return None
+    information = information_by_axis(
+        np.einsum("mkp,mkq->kpq", each, each),
+        np.sum(residual[0] ** 2, axis=0),
+        used,
+        np.asarray(lever[0]),
+        lambda matrix: inverses(matrix[None], eps)[0],
+    )
+    values = np.linalg.eigvalsh(information / scale)
     least = variance / (LARGEST_SD * lever[0]) ** 2
     weak = values[0] <= least and eps * values.sum() < least
     status = Status.UNOBSERVABLE if weak else Status.CONVERGED
@@ -82,10 +96,10 @@ def _with_uncertainty(found: ClosedForm, problem: Problem, plan: SolvePlan) -> C
     parts = [seen.unknowns.further[name] for name in FURTHER if name in blocks]
     further = np.array([part[0] for block in parts for part in block])
     gradient = np.abs(errors @ rows)
-    length = np.sqrt(np.diag(information) * objective)
+    length = np.sqrt(np.diag(design) * objective)
     # With exact data the errors are only rounding, and their gradient means nothing.
-    rounding = used * (64 * eps * lever[0]) ** 2
-    cosine = 0.0 if objective <= rounding else float(np.max(gradient / np.maximum(length, 1e-300)))
+    exact = objective <= rounding(used, np.asarray(lever[0]))
+    cosine = 0.0 if exact else float(np.max(gradient / np.maximum(length, 1e-300)))
     trace = None
     if plan.options.trace:
         trace = np.full(plan.options.trace, np.nan)
@@ -123,7 +137,7 @@ def _with_uncertainty(found: ClosedForm, problem: Problem, plan: SolvePlan) -> C
         ),
         linearisation=Linearisation(
             information=information,
-            design=information,
+            design=design,
             variance=np.asarray(variance),
             tracker_sd=None,
             average_elevation_sd=None,

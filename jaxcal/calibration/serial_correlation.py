@@ -36,7 +36,7 @@ from dataclasses import replace
 import numpy as np
 
 from jaxcal.diagnostics.image_errors import further_prior
-from jaxcal.diagnostics.influence import whitened_errors
+from jaxcal.diagnostics.influence import WhitenedErrors, whitened_errors
 from jaxcal.model.unknowns import block_slice
 from jaxcal.result.calibration import Calibration, Medium
 from jaxcal.runtime.array_types import Float
@@ -85,7 +85,7 @@ def widened(result: Calibration) -> Calibration:
         return result
     answer = map_arrays(lambda leaf: np.asarray(leaf)[None], result)
     whitened = whitened_errors(answer)
-    before, after = _covariances(whitened.errors, whitened.rows, further_prior(answer)[0])
+    before, after = _covariances(whitened, further_prior(answer)[0])
     linearisation = result.linearisation
     # The information about all unknowns changes in the same proportion.
     variance = float(linearisation.variance)
@@ -117,21 +117,19 @@ def _wider_medium(
 
 
 def _covariances(
-    errors: Float[np.ndarray, "m 3"],
-    rows: Float[np.ndarray, "m 3 p"],
-    precision: Float[np.ndarray, " p"],
+    whitened: WhitenedErrors, precision: Float[np.ndarray, " p"]
 ) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "p p"]]:
     """Covariances of the unknowns without and with the correlation."""
-    each, prior = np.einsum("mkp,mkq->kpq", rows, rows), np.diag(precision)
-    before = np.linalg.inv(each.sum(axis=0) + prior)
+    errors, rows, prior = whitened.errors, whitened.rows, np.diag(precision)
+    inverse, before = whitened.covariances(precision)
     spectra = _spectra(len(errors))
     waves = _cosine_transform(np.concatenate([rows, errors[..., None]], axis=2))
     middle = prior
     for k, factor in enumerate(_factors(waves, spectra, prior)):
         along = waves[:, k, :-1]
-        middle = middle + (along.T * (factor @ spectra)) @ along
+        middle = middle + whitened.variances[k] * (along.T * (factor @ spectra)) @ along
     lower = np.linalg.cholesky(before)
-    inner = np.linalg.solve(lower, before @ middle @ before)
+    inner = np.linalg.solve(lower, inverse @ middle @ inverse)
     values, vectors = np.linalg.eigh(np.linalg.solve(lower, inner.T))
     turned = lower @ vectors
     return before, (turned * np.maximum(values, 1.0)) @ turned.T

@@ -11,6 +11,13 @@ an image moves the answer, and whether that is more than expected.
 *Kinds of errors.* S is the sum of the information from lateral position, range and offset:
 S = sum S_k. The covariance S^-1 = sum S^-1 S_k S^-1 then shows how much comes from each kind.
 
+*Fits with equal weights* (conventional, bounded) are whitened by their pooled SD. Conventional
+errors have a variance v_k for each axis, in units of the pooled one
+(:func:`jaxcal.diagnostics.uncertainty.variances_by_axis`), so the covariance is the sum of
+v_k S^-1 S_k S^-1. With V = diag(v_k), the errors that are left in image i have the covariance
+V - H_i V - V H_i + R_i C R_i' with the unknowns' covariance C (I - H_i where all v_k are 1).
+Within bounds, the part of an error that depends on a free offset is projected out.
+
 *What the residuals say.* S^-1 (sum R_i'(I - H_i)^-1/2 e_i e_i'(I - H_i)^-1/2 R_i + P) S^-1 with
 the priors' information P has the expectation S^-1 if the model holds, and is a valid covariance
 even if it does not: it is larger where a few images pull, or where errors are large in images that
@@ -19,15 +26,12 @@ matter.
 All this is of the errors one by one: S is the information before errors that are alike in
 successive images reduced it (:mod:`jaxcal.calibration.serial_correlation`).
 
-Fits with equal weights (conventional, bounded) are whitened by their pooled SD; the part of an
-error that depends on an offset free within bounds is projected out.
-
 References: Cook 1977 (leaving out); MacKinnon and White 1985 (the residuals' covariance, HC2).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -40,7 +44,7 @@ from jaxcal.diagnostics.image_errors import (
     own_covariance,
     quadratic,
 )
-from jaxcal.diagnostics.uncertainty import inverses
+from jaxcal.diagnostics.uncertainty import inverses, variances_by_axis
 from jaxcal.model.unknowns import predicted_distance
 from jaxcal.result.calibration import Calibration, check_one, data_of
 from jaxcal.runtime.array_types import Bool, Float, Int
@@ -64,8 +68,8 @@ class Influence:
             is.
         shares: the part of the covariance that comes from each of :data:`KINDS`.
         residual_covariance: covariance of the unknowns, estimated from the residuals.
-        residual_rows: R_i S^-1: how far each error moves the unknowns per SD.
-        model_covariance: S^-1 of the same linearisation.
+        residual_rows: V^1/2 R_i S^-1: how far each error moves the unknowns per SD.
+        model_covariance: of the unknowns, if the model holds.
         log_density: of each image's three errors as predicted from the others (mm); 0 where not in
             use.
     """
@@ -80,7 +84,7 @@ class Influence:
 
 
 @dataclass(frozen=True)
-class _Errors:
+class WhitenedErrors:
     """Whitened errors of the images in use.
 
     Attributes:
@@ -90,6 +94,7 @@ class _Errors:
         log_sd: sum of the logarithms of an image's SDs, mm.
         used: which images are in use.
         images: number of all images.
+        variances: v_k of the errors; ones where each is in its own SD.
     """
 
     errors: Float[Array, "m k"]
@@ -98,6 +103,20 @@ class _Errors:
     log_sd: Float[Array, " m"]
     used: Bool[Array, " n"]
     images: int
+    variances: Float[Array, " k"]
+
+    def covariances(
+        self, precision: Float[Array, " p"]
+    ) -> tuple[Float[Array, "p p"], Float[Array, "p p"]]:
+        """S^-1 and the covariance of the unknowns, with the precision of their priors."""
+        by_error = np.einsum("mkp,mkq->kpq", self.rows, self.rows)
+        inverse = inverses((by_error.sum(axis=0) + np.diag(precision))[None], np.finfo(float).eps)[
+            0
+        ]
+        if (self.variances == 1).all():
+            return inverse, inverse
+        middle = np.einsum("k,kpq->pq", self.variances, by_error) + np.diag(precision)
+        return inverse, inverse @ middle @ inverse
 
 
 def influence_of(calibration: Calibration) -> Influence:
@@ -125,7 +144,7 @@ def _first(leaf: Any) -> Array:
 
 
 def _influence(
-    found: _Errors,
+    found: WhitenedErrors,
     precision: Float[Array, " p"],
     away: Float[Array, " p"],
     *,
@@ -134,30 +153,43 @@ def _influence(
     """Influence of whitened errors and a prior of this precision, from which the answer is away."""
     rows, errors = found.rows, found.errors
     components = rows.shape[1]
-    by_kind = np.einsum("mkp,mkq->kpq", rows, rows)
-    information = by_kind.sum(axis=0) + np.diag(precision)
-    inverse = inverses(information[None], np.finfo(float).eps)[0]
+    inverse, covariance = found.covariances(precision)
     if not at_minimum:
         # An answer averaged over laws, or an alternation that stopped early, does not minimise
         # these errors: take them at the minimum.
         gradient = np.einsum("mkp,mk->p", rows, errors) + precision * away
         errors = errors - np.einsum("mkp,p->mk", rows, inverse @ gradient)
-    by_kind = np.stack([by_kind[found.kind == kind].sum(axis=0) for kind in range(len(KINDS))])
+    own = np.sqrt(found.variances)[:, None] * rows
+    by_error = np.einsum("mkp,mkq->kpq", own, own)
+    by_kind = np.stack([by_error[found.kind == kind].sum(axis=0) for kind in range(len(KINDS))])
 
     steps = rows @ inverse
     leverage = steps @ np.swapaxes(rows, 1, 2)
-    values, vectors = np.linalg.eigh(np.eye(components) - 0.5 * (leverage + leverage.mT))
+    left = np.eye(components) - 0.5 * (leverage + leverage.mT)
+    values, vectors = np.linalg.eigh(left)
     # Without an image that alone determines a direction there is no answer to move to.
     alone = (values <= _LEAST_LEFT).any(axis=1)
     values = np.maximum(values, _LEAST_LEFT)
     turned = np.einsum("mkl,mk->ml", vectors, errors)
     # (I - H)^-1/2 R S^-1, in the directions of the eigenvectors.
-    expected = (vectors / np.sqrt(values)[:, None]).mT @ steps
-    residual = np.einsum("mk,mkp->mp", turned, expected)
-    moved = np.einsum("mk,mkp->mp", turned / np.sqrt(values), expected)
+    halfway = (vectors / np.sqrt(values)[:, None]).mT @ steps
+    residual = np.einsum("mk,mkp->mp", turned, halfway)
+    moved = np.einsum("mk,mkp->mp", turned / np.sqrt(values), halfway)
+    # The covariance of the errors that are left.
+    spreads, axes = values, vectors
+    if covariance is not inverse:
+        other = (np.eye(components) - leverage) * found.variances - found.variances[:, None] * (
+            leverage.mT
+        )
+        spreads, axes = np.linalg.eigh(other + rows @ covariance @ np.swapaxes(rows, 1, 2))
+        spreads = np.maximum(spreads, _LEAST_LEFT)
+    across = np.sqrt(spreads)[..., None] * (axes.mT @ (vectors / np.sqrt(values)[:, None]))
+    expected = across @ halfway
     moved[alone], expected[alone] = np.nan, np.nan
-    # Predicted from the others, an error is (I - H)^-1 e, with the covariance (I - H)^-1.
-    density = -0.5 * np.sum(turned**2 / values, axis=1) + 0.5 * np.sum(np.log(values), axis=1)
+    # Predicted from the others, an error is (I - H)^-1 times what is left of it.
+    along = np.einsum("mkl,mk->ml", axes, errors)
+    density = -0.5 * np.sum(along**2 / spreads + np.log(spreads), axis=1)
+    density = density + np.sum(np.log(values), axis=1)
     density = density - 0.5 * components * np.log(2 * np.pi) - found.log_sd
 
     def everywhere(values: Array) -> Array:
@@ -170,13 +202,13 @@ def _influence(
         expected=everywhere(expected),
         shares=inverse @ by_kind @ inverse,
         residual_covariance=residual.T @ residual + inverse * precision @ inverse,
-        residual_rows=everywhere(steps),
-        model_covariance=inverse,
+        residual_rows=everywhere(own @ inverse),
+        model_covariance=covariance,
         log_density=everywhere(density),
     )
 
 
-def whitened_errors(answer: Calibration) -> _Errors:
+def whitened_errors(answer: Calibration) -> WhitenedErrors:
     """Errors of a calibration with one leading axis of length 1, in SDs and uncorrelated."""
     seen = ImageErrors.of_answer(answer)
     used = np.asarray(answer.mask)[0] > 0
@@ -187,10 +219,19 @@ def whitened_errors(answer: Calibration) -> _Errors:
     sd = float(np.sqrt(answer.linearisation.variance[0]))
     y = np.asarray(answer.elevation) if answer.prior == "bounded" else np.zeros_like(seen.mask)
     free = used & (answer.at_bound[0] == 0) if answer.prior == "bounded" else None
-    return _equal_weights(seen, y, sd, used, free)
+    found = _equal_weights(seen, y, sd, used, free)
+    if answer.prior == "bounded":
+        return found
+    parts = np.einsum("mkp,mkq->kpq", found.rows, found.rows)
+    inverse = inverses(parts.sum(axis=0)[None], np.finfo(float).eps)[0]
+    squares, count = np.sum(found.errors**2, axis=0), np.asarray(float(len(found.rows)))
+    lever = seen.lever(np.asarray(answer.mask))[0] / sd
+    return replace(
+        found, variances=variances_by_axis(parts, squares, count, inverse, np.asarray(lever))
+    )
 
 
-def _from_points(answer: Calibration, seen: ImageErrors, used: Array) -> _Errors:
+def _from_points(answer: Calibration, seen: ImageErrors, used: Array) -> WhitenedErrors:
     tau = answer.linearisation.tracker_sd
     seen = seen.shifted(answer).centred(answer)
     whitened = Whitened.of(answer, seen)
@@ -212,10 +253,10 @@ def _from_points(answer: Calibration, seen: ImageErrors, used: Array) -> _Errors
     if tau is not None:
         sigma = np.hypot(sigma, float(tau[0]) * np.array([1.0, 1.0, 0.0]))
     log_sd = log_sd + np.sum(np.log(sigma))
-    return _Errors(errors, rows, np.arange(3), log_sd, used, len(used))
+    return WhitenedErrors(errors, rows, np.arange(3), log_sd, used, len(used), np.ones(3))
 
 
-def _from_channels(answer: Calibration, seen: ImageErrors, used: Array) -> _Errors:
+def _from_channels(answer: Calibration, seen: ImageErrors, used: Array) -> WhitenedErrors:
     channels, sigma = seen.problem.channels, np.asarray(answer.sigma)[0]
     assert channels is not None
     assert answer.channel_sigma is not None
@@ -234,7 +275,7 @@ def _from_channels(answer: Calibration, seen: ImageErrors, used: Array) -> _Erro
     # Lateral position and range come from the same elements, whose errors count as range errors.
     kind = np.array([1] * len(elements) + [2])
     log_sd = listened.sum(axis=1) * np.log(element_sd) + np.log(sigma[2])
-    return _Errors(errors, rows, kind, log_sd, used, len(used))
+    return WhitenedErrors(errors, rows, kind, log_sd, used, len(used), np.ones(len(kind)))
 
 
 def _equal_weights(
@@ -243,7 +284,7 @@ def _equal_weights(
     sd: float,
     used: Bool[Array, " n"],
     free: Bool[Array, " n"] | None = None,
-) -> _Errors:
+) -> WhitenedErrors:
     """Errors with one SD; the part along a ``free`` offset's circle is projected out."""
     residual, axial = seen.from_circle(y)
     rows = seen.circle_rows(axial)[0][used]
@@ -256,7 +297,8 @@ def _equal_weights(
         rows = rows - along[..., None] * np.einsum("mk,mkp->mp", along, rows)[:, None]
         errors = errors - along * np.sum(along * errors, axis=1, keepdims=True)
     log_sd = np.full(int(used.sum()), 3 * np.log(sd))
-    return _Errors(errors / sd, rows / sd, np.array([0, 2, 1]), log_sd, used, len(used))
+    kind, ones = np.array([0, 2, 1]), np.ones(3)
+    return WhitenedErrors(errors / sd, rows / sd, kind, log_sd, used, len(used), ones)
 
 
 @dataclass(frozen=True)

@@ -103,8 +103,8 @@ def student_variance(left: Float[AnyArray, "*#b"]) -> Float[AnyArray, "*b"]:
 def variance_factor(calibration: Calibration) -> Float[AnyArray, "*batch"]:
     """The factor by which mean square errors exceed what the covariance says (traceable).
 
-    It is 1 for a single pooled variance, which is estimated without bias. SDs that are tuned to the
-    same images are also the weights of the fit. This makes the answer's error larger than with
+    It is 1 for a fit with equal weights, whose variances are estimated nearly without bias. SDs
+    that are tuned to the same images are also the weights of the fit. This makes the answer's error larger than with
     known weights, and larger than the covariance says (Kackar and Harville 1984). Student's
     variance corrects for both: see ``experiments/tre_calibration.py``.
     """
@@ -126,9 +126,7 @@ def transform_intervals(
 
     Returns:
         Along the image's lateral, elevational and axial axes in mm, then about them in rad; NaN
-        where X is not observable. Those of the conventional method assume errors of one size along
-        all three axes: where offsets are larger than the errors of the points, they are too short
-        for rotations about the lateral and axial axes.
+        where X is not observable.
 
     Raises:
         InputError: a level that is not between 0 and 1.

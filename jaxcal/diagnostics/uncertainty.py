@@ -12,10 +12,18 @@ shared unknowns, D_i = k_i'k_i and E_i = J_i'k_i. A function with the derivative
 unknowns and b by the offset unknown has the variance
 
     (a - b E_i / D_i)' S^-1 (a - b E_i / D_i) + b^2 / D_i.
+
+The conventional fit weighs lateral, elevational and axial errors equally, but offsets are usually
+larger than the errors of the points. With S = sum S_k, the sum of the axes' normal matrices, and
+variances v_k of the axes' errors, its unknowns have the covariance S^-1 (sum v_k S_k) S^-1
+(:func:`information_by_axis`).
+
+Reference: White 1980 (covariance of a fit whose weights are not those of its errors).
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,6 +44,10 @@ SINGULAR = 1e-11
 
 LARGEST_SD = 0.5
 """A direction whose SD exceeds this fraction of the lever arm is not known in any useful sense."""
+
+POOLED_SHARE = 0.5
+"""How many errors of the pooled variance count with each axis's own. With four or five images an
+axis may have hardly any degree of freedom left, and then has the pooled variance."""
 
 AT_BOUND = 1e-12
 """An offset within this fraction of its bound counts as on it; the difference is rounding."""
@@ -147,6 +159,70 @@ class Spectra:
             weakest = np.where(degenerate[:, None], nearest_unknown(unseen, null), weakest)
         sd = np.where(unknown, np.nan, np.sqrt(variance / smallest))
         return cls(values[:, -1] / smallest, weakest, sd)
+
+
+def rounding(used: Float[AnyArray, "*batch"], lever: Float[AnyArray, "*batch"]) -> Any:
+    """A sum of squared residuals up to this, mm^2, is rounding: the data are exact."""
+    return used * (64 * np.finfo(lever.dtype).eps * lever) ** 2
+
+
+def variances_by_axis(
+    parts: Float[AnyArray, "k p p *batch"],
+    squares: Float[AnyArray, " k *batch"],
+    used: Float[AnyArray, "*batch"],
+    inverse: Float[AnyArray, "p p *batch"],
+    lever: Float[AnyArray, "*batch"],
+) -> Any:
+    """Variance of each axis's errors over the pooled one, in a fit with equal weights.
+
+    Args:
+        parts: S_k, the axes' normal matrices.
+        squares: sums of the axes' squared residuals, mm^2.
+        used: number of images.
+        inverse: of S = sum S_k.
+        lever: lever arm, mm.
+
+    Returns:
+        (3, *batch); ones where residuals are only rounding.
+    """
+    xp = array_module(parts, squares)
+    # An axis's residuals have n - tr(S^-1 S_k) degrees of freedom.
+    freedom = used - (inverse * parts).sum(axis=(1, 2))
+    whole = squares.sum(axis=0)
+    exact = whole <= rounding(used, lever)
+    pooled = xp.where(exact, 1.0, whole) / xp.maximum(3 * used - len(inverse), 1.0)
+    found = (squares / pooled + POOLED_SHARE) / (freedom + POOLED_SHARE)
+    return xp.where(exact, 1.0, found)
+
+
+def information_by_axis(
+    parts: Float[AnyArray, "k p p *batch"],
+    squares: Float[AnyArray, " k *batch"],
+    used: Float[AnyArray, "*batch"],
+    lever: Float[AnyArray, "*batch"],
+    invert: Callable[[Any], Any],
+) -> Any:
+    """Information of a fit with equal weights, if errors have a variance for each axis.
+
+    Args:
+        parts: S_k, the axes' normal matrices.
+        squares: sums of the axes' squared residuals, mm^2.
+        used: number of images.
+        lever: lever arm, mm.
+        invert: inverts symmetric matrices (p, p, *batch).
+
+    Returns:
+        S (sum v_k S_k)^-1 S, (p, p, *batch), with the variances v_k in units of the pooled one. It
+        is S if they are equal.
+    """
+    whole = parts.sum(axis=0)
+    variances = variances_by_axis(parts, squares, used, invert(whole), lever)
+    middle = (variances[:, None, None] * parts).sum(axis=0)
+
+    def product(left: Any, right: Any) -> Any:
+        return (left[:, :, None] * right[None]).sum(axis=1)
+
+    return product(product(whole, invert(middle)), whole)
 
 
 def threshold(eps: float) -> float:

@@ -384,10 +384,10 @@ class InPlane(Observation):
     """q - p(0), every target taken to lie in the image plane: the conventional Eq. 7, mm.
 
     Attributes:
-        sigma: ones; the residuals stay in mm.
+        sigma: ones, for all axes together or for each of them; the residuals stay in mm.
     """
 
-    sigma: Float[Array, "1 batch"]
+    sigma: Float[Array, "components batch"]
     whitened: ClassVar[bool] = False
 
     @classmethod
@@ -395,11 +395,17 @@ class InPlane(Observation):
         """For these images."""
         return cls(_unit(images))
 
+    def by_axis(self) -> InPlane:
+        """The same with the axes as components of their own: lateral, elevational, axial."""
+        return InPlane(jnp.repeat(self.sigma[:1], 3, axis=0))
+
     def components(
         self, q: Vector, further: FurtherUnknowns, images: ImagePlanes
     ) -> list[Component]:
         lateral, distance = further.points(images)
-        return [Component([q[0] - lateral, q[1], q[2] - distance])]
+        errors = [q[0] - lateral, q[1], q[2] - distance]
+        together = len(self.sigma) == 1
+        return [Component(errors)] if together else [Component([error]) for error in errors]
 
 
 class HeldOffsets(Observation):

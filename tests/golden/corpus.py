@@ -671,6 +671,7 @@ DIFFERENT: tuple[tuple[str, str, str, str, tuple[int, ...]], ...] = (
             21,
             23,
             29,
+            33,
             34,
             35,
             42,

@@ -10,24 +10,32 @@ SHARES = (1 / 3, 2 / 3, 1.0)
 FEWEST_IMAGES = 20
 
 
-def widened(covariance: np.ndarray, along: np.ndarray, errors: np.ndarray) -> np.ndarray:
-    """The covariance of a fit in the proportion in which a correlation widens (J' J)^-1.
+def widened(
+    covariance: np.ndarray,
+    along: np.ndarray,
+    errors: np.ndarray,
+    variances: np.ndarray | None = None,
+) -> np.ndarray:
+    """The covariance of a fit in the proportion in which a correlation widens that of the errors.
 
     Args:
-        covariance: (p, p) for independent errors: (J' J)^-1 times a variance.
+        covariance: (p, p) for independent errors.
         along: (3, n, p) Jacobian J by kind of error (lateral, range, offset), whitened.
         errors: (3, n) in SDs.
+        variances: (3,) of the errors, where they are not in their own SDs.
     """
     if errors.shape[1] < FEWEST_IMAGES:
         return covariance
     models = _models(errors.shape[1])
-    before = np.linalg.inv(np.einsum("knp,knq->pq", along, along))
-    middle = sum(j.T @ c @ j for j, c in zip(along, _expected(models, along, errors), strict=True))
+    sizes = np.ones(3) if variances is None else variances
+    inverse = np.linalg.inv(np.einsum("knp,knq->pq", along, along))
+    before = inverse @ np.einsum("k,knp,knq->pq", sizes, along, along) @ inverse
+    expected = zip(sizes, along, _expected(models, along, errors), strict=True)
+    after = inverse @ sum(v * j.T @ c @ j for v, j, c in expected) @ inverse
     # It makes no direction more certain: symmetric square roots, then eigenvalues of at least 1.
     values, vectors = np.linalg.eigh(before)
     root = (vectors * np.sqrt(values)) @ vectors.T
-    inverse = np.linalg.inv(root)
-    values, vectors = np.linalg.eigh(inverse @ before @ middle @ before @ inverse)
+    values, vectors = np.linalg.eigh(np.linalg.inv(root) @ after @ np.linalg.inv(root))
     after = root @ (vectors * np.maximum(values, 1.0)) @ vectors.T @ root
     return after * np.trace(covariance @ np.linalg.inv(before)) / len(before)
 

@@ -21,6 +21,26 @@ def residual_variance(cost: float, images: int, unknowns: int, free_offsets: int
     return cost / (3 * images - unknowns - free_offsets)
 
 
+def axis_variances(along: np.ndarray, residual: np.ndarray, pooled: float) -> np.ndarray:
+    """(3,) mm^2: of the errors along each axis, from a fit with equal weights.
+
+    Args:
+        along: (n, 3, p) Jacobian.
+        residual: (n, 3) mm.
+        pooled: variance of all residuals, which counts as half a residual of each axis.
+    """
+    orthonormal, _ = np.linalg.qr(along.reshape(-1, along.shape[-1]))
+    left = 1 - np.sum(orthonormal**2, axis=1).reshape(residual.shape)
+    return (np.sum(residual**2, axis=0) + pooled / 2) / (left.sum(axis=0) + 1 / 2)
+
+
+def covariance_by_axis(along: np.ndarray, variances: np.ndarray) -> np.ndarray:
+    """Of the unknowns of a fit with equal weights to errors of these variances."""
+    each = np.broadcast_to(variances, along.shape[:2]).ravel()
+    steps = np.linalg.pinv(along.reshape(-1, along.shape[-1]))
+    return (steps * each) @ steps.T
+
+
 def offset_sd(data: Data, u: Unknowns, blocks: tuple[str, ...], shared: np.ndarray) -> np.ndarray:
     """SD of q_iy, mm."""
     along = jacobian(lambda step: target(data, u.moved(step, blocks))[:, 1], size(blocks))
