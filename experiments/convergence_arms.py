@@ -251,7 +251,8 @@ def _arm(make: Callable[[Array, ImagePlanes], Observation], exact: bool) -> Call
                 exact_below=EXACT_BELOW if exact else 0.0,
             )
 
-        begun = Descent.before(place, jnp.zeros_like(images.mask[:, 0]), 1e-3, trace=STEPS)
+        number = jnp.zeros_like(images.mask[:, 0])
+        begun = Descent.first(place, number, 1e-3, STEPS, exact_next=number)
         return Outcome.of(jax.lax.while_loop(lambda state: jnp.any(state.active), one, begun))
 
     return solve

@@ -3,10 +3,21 @@
 from __future__ import annotations
 
 import ast
+import inspect
 from pathlib import Path
+from typing import get_type_hints
 
 import jaxtyping
 import numpy as np
+import optimistix as optx
+import pytest
+import xarray
+from matplotlib.figure import Figure
+
+import jaxcal
+import jaxcal.design
+import jaxcal.study
+from jaxcal.data.segmentation.segment import Segmentation
 
 HOME = Path(__file__).parents[1]
 
@@ -36,3 +47,21 @@ def test_every_shape_can_be_read():
 def test_shapes_that_mean_nothing_are_found():
     wrong = "a: Float[Array, 3]\ndef f(b: Int[np.ndarray, '*k ...']) -> Float[Array, ' 3']: ..."
     assert unreadable(wrong) == ["Float[Array, 3]", "Int[np.ndarray, '*k ...']"]
+
+
+def readable(value: object) -> list[object]:
+    """What of a public name has annotations: a function, or a class with its methods."""
+    if not inspect.isclass(value):
+        return [value] if inspect.isfunction(value) else []
+    named = [each for name, each in vars(value).items() if not name.startswith("_")]
+    own = [getattr(each, "__func__", getattr(each, "fget", each)) for each in named]
+    return [value, *filter(inspect.isfunction, own)]
+
+
+@pytest.mark.parametrize("module", [jaxcal, jaxcal.design, jaxcal.study])
+def test_annotations_of_public_names_can_be_evaluated(module):
+    # These are imported for the type checker alone: they take long, or need not be installed.
+    late = {"Figure": Figure, "Segmentation": Segmentation, "optx": optx, "xarray": xarray}
+    for name in dir(module):
+        for each in readable(getattr(module, name)):
+            get_type_hints(each, localns=late)

@@ -16,8 +16,7 @@ from hypothesis import strategies as st
 import jaxcal
 from jaxcal.calibration import pipeline
 from jaxcal.calibration.calibrate import Request, prepare
-from jaxcal.calibration.engine import fill_up
-from jaxcal.data.problem import taken
+from jaxcal.data.problem import lengthened, taken
 from jaxcal.runtime import executables
 from jaxcal.runtime.arrays import each_image, first_images
 from jaxcal.runtime.executables import FEWEST_PADDED, bucket, padded_images
@@ -60,7 +59,7 @@ def test_every_axis_of_images_is_known(problems):
     assert cut.residual.shape == (9, 3)
     assert cut.inspection.outlier.shape == (9,)
     raw = jaxcal.simulate_recording(jaxcal.Protocol(images=12, raw=True), 1)
-    channels = fill_up(jaxcal.Problem.from_recording(raw), 16).channels
+    channels = lengthened(jaxcal.Problem.from_recording(raw), 16).channels
     assert channels is not None
     assert channels.distances.shape == channels.heard.shape == (16, 128)
     assert channels.elements.shape == (128, 3)

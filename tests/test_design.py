@@ -696,7 +696,6 @@ def test_simulated_errors_count_the_images_taken_before():
         ({"candidates": None}, "candidates"),
         ({"poses": np.tile(np.eye(4), (2, 2, 5, 1, 1))}, "poses must be"),
         ({"trials": 1}, "trials"),
-        ({"law": "gaussian"}, "law must be one of"),
     ],
 )
 def test_simulations_that_cannot_be(change, match):

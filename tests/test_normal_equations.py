@@ -515,7 +515,8 @@ def test_a_step_that_fails_is_tried_again_with_more_damping(drawn):
     @jax.jit
     def begun():
         away = place.moved([jnp.full(PROBLEMS, float(value)) for value in far])
-        start = Descent.before(away, jnp.zeros(PROBLEMS), 1e-9)
+        number = jnp.zeros(PROBLEMS)
+        start = Descent.first(away, number, 1e-9, exact_next=number)
         return start, Rounding.of(away, observation, images)
 
     state, rounding = begun()

@@ -72,7 +72,7 @@ class ProbeStage:
         """
         self.plan_pose = self._targets[row].copy()
         try:
-            self._move(self.plan_pose, None)
+            self._move(self.plan_pose)
             return
         except RefusedError as error:
             if self._motion.ended:  # refused while it moved, for good: no other way helps
@@ -84,7 +84,7 @@ class ProbeStage:
             self._note("detour", f"{error}; through poses {near + 1} to {row + 1} of the plan")
         step = 1 if row > near else -1
         for passing in range(near, row + step, step):
-            self._move(self._targets[passing], None)
+            self._move(self._targets[passing])
 
     def move(self, offset_mm: float) -> float:
         """Go to an offset (mm) along the elevational axis; the offset as tracked.
@@ -97,7 +97,7 @@ class ProbeStage:
         direction = pose[:3, :3] @ self._axis
         pose[:3, 3] += offset_mm * direction
         try:
-            tracked = self._move(pose, None).pose
+            tracked = self._move(pose).pose
         except RefusedError as error:
             if self._motion.ended:  # refused while it moved, for good
                 raise
@@ -232,11 +232,11 @@ class ProbeStage:
         """Bench time since which neither the probe nor the threshold has changed."""
         return self._arrived
 
-    def _move(self, pose: np.ndarray, speed_mm_s: float | None) -> PoseSample:
+    def _move(self, pose: np.ndarray) -> PoseSample:
         for hesitation in range(_MOST_HESITATIONS + 1):
             self._session.wait_until_clear()
             try:
-                sample = self._motion.move_to(pose, speed_mm_s)
+                sample = self._motion.move_to(pose)
             except StaleError as error:
                 if self._motion.ended or hesitation == _MOST_HESITATIONS:
                     raise

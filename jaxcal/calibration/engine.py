@@ -8,7 +8,7 @@ somebody's jit, vmap or grad, and with a solver of the caller's own, JAX compile
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any, TypeVar
 
@@ -17,10 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.data.problem import Problem, taken
+from jaxcal.data.problem import Problem, lengthened
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime import compiler, executables
-from jaxcal.runtime.arrays import assembled, first_images, map_arrays
+from jaxcal.runtime.arrays import first_images, map_arrays
 from jaxcal.runtime.executables import bucket, padded_images
 from jaxcal.runtime.jax_modes import in_own_modes, inside_transformation
 from jaxcal.solvers.closed_form.single import closed_form_start
@@ -70,7 +70,7 @@ def _solve_compiled(problem: Problem, given: Given, plan: SolvePlan) -> Calibrat
 
 def _solve_kept(problem: Problem, given: Given, plan: SolvePlan) -> Calibration:
     """Solve one problem by kept programs, which serve several numbers of images."""
-    padded = fill_up(problem, padded_images(problem.images))
+    padded = lengthened(problem, padded_images(problem.images))
     run = partial(executables.run, flags=compiler.ONE_PROBLEM)
     label = _label(plan, padded.images)
     agreed, used = None, problem
@@ -85,19 +85,6 @@ def _solve_kept(problem: Problem, given: Given, plan: SolvePlan) -> Calibration:
     arguments = (padded, given, agreed, start)
     result = run("jaxcal.calibration.pipeline:solve_one", arguments, plan, label=label)
     return as_jax_holds(first_images(result, problem.images), problem)
-
-
-def fill_up(problem: Problem, images: int) -> Problem:
-    """A problem or batch padded with masked images to a number; in numpy arrays if it is padded."""
-    more = images - problem.images
-    if not more:
-        return problem
-    rows = [*range(problem.images), *[problem.images - 1] * more]  # a masked pose must be rigid
-    mask = np.asarray(problem.mask)
-    mask = np.concatenate([mask, np.zeros((*mask.shape[:-1], more), mask.dtype)], axis=-1)
-    longer = taken(problem, rows)
-    parts = {field.name: getattr(longer, field.name) for field in fields(longer)}
-    return assembled(Problem, parts | {"mask": mask})
 
 
 @in_own_modes
@@ -164,7 +151,7 @@ def _solve_chunks_kept(
     padded = problems
     if count <= FEW_PROBLEMS:
         # Here a person waits for the compiler; of thousands, masked images would cost run time.
-        padded = fill_up(problems, bucket(images))
+        padded = lengthened(problems, bucket(images))
     size = bucket(pieces) if pieces > 1 else 1
     done = last and size * chunk == count and padded.images == images
     if size * chunk != count:

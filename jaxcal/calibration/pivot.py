@@ -26,20 +26,20 @@ from jaxcal.data.problem import Problem
 from jaxcal.data.recording import LEAST_REACH_MM, MINIMUM_IMAGES, MetresError
 from jaxcal.diagnostics.outliers import listed_outliers, outliers
 from jaxcal.diagnostics.uncertainty import LARGEST_SD, Spectra
+from jaxcal.model.outlying import stands_out
 from jaxcal.model.parameters import Parameters, retract
 from jaxcal.model.residuals import target_in_image
-from jaxcal.result.calibration import Status
+from jaxcal.model.thresholds import FEWEST_IMAGES
+from jaxcal.result.calibration import Status, check_one
 from jaxcal.runtime import compiler, executables
 from jaxcal.runtime.arrays import first_images, is_traced
 from jaxcal.runtime.given_values import check_flag, real_array
 from jaxcal.runtime.jax_modes import in_own_modes, inside_transformation, require_float64
 from jaxcal.solvers import dense
 from jaxcal.solvers.consensus import (
-    FEWEST_IMAGES,
     ConsensusModel,
     find_consensus,
     linearise,
-    stands_out,
     studentised_errors,
 )
 
@@ -121,8 +121,7 @@ class Pivot(eqx.Module):
         Raises:
             InputError: of a batch.
         """
-        if np.ndim(self.status_code):
-            raise InputError("a batch holds many calibrations: look at each one's rms")
+        check_one(self.status_code)
         if self.status == "failed" or not float(self.rms) > _LARGEST_RMS_MM:
             return None
         return (
@@ -138,8 +137,7 @@ class Pivot(eqx.Module):
         Raises:
             InputError: of a batch.
         """
-        if np.ndim(self.status_code):
-            raise InputError("a batch holds many calibrations, each with warnings of its own")
+        check_one(self.status_code)
         found = []
         if self.status == "failed":
             return ["the solve failed: its result holds no usable numbers"]
@@ -175,8 +173,7 @@ class Pivot(eqx.Module):
         """
         from jaxcal.report.pivot import pivot_record
 
-        if np.ndim(self.status_code):
-            raise InputError("a batch holds many calibrations, each with a record of its own")
+        check_one(self.status_code)
         return pivot_record(self)
 
     def __str__(self) -> str:

@@ -32,18 +32,15 @@ series).
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jaxcal.diagnostics.image_errors import further_prior
 from jaxcal.diagnostics.influence import WhitenedErrors, whitened_errors
 from jaxcal.model.unknowns import block_slice
+from jaxcal.result.calibration import Calibration, Medium
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.arrays import like, map_arrays
-
-if TYPE_CHECKING:
-    from jaxcal.result.calibration import Calibration, Medium
 
 CORRELATIONS = np.arange(0.04, 1.0, 0.08)
 """Correlations of the correlated part of successive errors that are weighed."""

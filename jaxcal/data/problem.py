@@ -10,9 +10,10 @@ from __future__ import annotations
 import os
 import sys
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 from jaxcal import InputError
 from jaxcal.data.probe import CurvilinearProbe
@@ -38,10 +39,6 @@ from jaxcal.runtime.arrays import (
 )
 from jaxcal.runtime.jax_modes import importing_jax, in_own_modes
 from jaxcal.runtime.messages import counted, shown
-
-if TYPE_CHECKING:
-    from jax.typing import DTypeLike
-
 
 _HOW = (
     "jaxcal.Problem.from_arrays(poses, measurements) makes one of arrays, jaxcal.load(path) reads "
@@ -340,11 +337,14 @@ def stack(problems: list[Problem]) -> Problem:
         kept = [leaf.sharding for leaf in leaves if isinstance(leaf, jax.Array) and leaf.committed]
         return jax.device_put(np.stack(leaves), *kept[:1])
 
-    return jax.tree.map(stacked, *(_lengthened(problem, most) for problem in problems))
+    return jax.tree.map(stacked, *(lengthened(problem, most) for problem in problems))
 
 
-def _lengthened(problem: Problem, images: int) -> Problem:
-    """The problem with so many images; those added repeat the last one and are masked out."""
+def lengthened(problem: Problem, images: int) -> Problem:
+    """A problem or batch with so many images; those added repeat the last one and are masked out.
+
+    Concrete ones that are lengthened come back in numpy arrays.
+    """
     count = problem.images
     if count in (0, images):
         return problem

@@ -7,6 +7,7 @@ rely on shapes, units and finite values.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, get_args
 
@@ -268,7 +269,7 @@ def make_images(
     face_offset_mm: float = 0.0,
     time_of_flight: np.ndarray | None = None,
     frame: np.ndarray | None = None,
-    frame_size: Any = None,
+    frame_size: Sequence[int] | np.ndarray | None = None,
     minimum: int = MINIMUM_IMAGES,
     where: str = "",
 ) -> Images:
@@ -308,12 +309,7 @@ def make_images(
         check_kind(kind)
         poses, values = real_array(poses, "poses"), real_array(measurements, "measurements")
         count = len(poses) if poses.ndim else 0
-        if values.ndim != 2:
-            raise InputError(f"{kind} must have two axes, it has shape {values.shape}")
-        if kind != "time_of_flight" and values.shape[1] != 2:
-            raise InputError(f"{kind} must have shape (n, 2), it has {values.shape}")
-        if len(values) != count:
-            raise InputError(f"{count} poses but {len(values)} rows of {kind}: they must match")
+        _check_shape(values, kind, count)
         used = _mask(mask, count)
         if not (is_number(minimum) and minimum >= 0):
             raise InputError(f"minimum must be a number of images, not {shown(minimum)}")
@@ -351,6 +347,15 @@ def make_images(
         return images
     except InputError as error:
         raise type(error)(f"{prefix}{error}") from None
+
+
+def _check_shape(values: np.ndarray, kind: Kind, count: int) -> None:
+    if values.ndim != 2:
+        raise InputError(f"{kind} must have two axes, it has shape {values.shape}")
+    if kind != "time_of_flight" and values.shape[1] != 2:
+        raise InputError(f"{kind} must have shape (n, 2), it has {values.shape}")
+    if len(values) != count:
+        raise InputError(f"{count} poses but {len(values)} rows of {kind}: they must match")
 
 
 def _refuse(name: str, bad: Any, what: str) -> None:
@@ -445,7 +450,9 @@ def _check_below_face(
     )
 
 
-def _frame_size(frame_size: Any, kind: Kind) -> tuple[int, int] | None:
+def _frame_size(
+    frame_size: Sequence[int] | np.ndarray | None, kind: Kind
+) -> tuple[int, int] | None:
     if frame_size is None:
         return None
     size = real_array(frame_size, "frame_size")

@@ -8,24 +8,20 @@ that the constraints do not allow are skipped.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jaxcal import InputError
 from jaxcal.data.poses import check_poses, nearest_rotations
 from jaxcal.data.probe import Probe
-from jaxcal.data.recording import check_recording
+from jaxcal.data.recording import Recording, check_recording
 from jaxcal.design.constraints import Constraints, Region
 from jaxcal.design.information import Model
 from jaxcal.design.noise import Noise, check_result, used_images
+from jaxcal.result.calibration import Calibration
+from jaxcal.result.transform import ImageTransform
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.given_values import LARGEST_SEED, check_made, whole_number
-
-if TYPE_CHECKING:
-    from jaxcal.data.recording import Recording
-    from jaxcal.result.calibration import Calibration
-    from jaxcal.result.transform import ImageTransform
 
 COUNT = 5000
 """Number of candidates of a plan; twice as many change the predicted error by less than 1 %."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,10 +12,8 @@ from jaxcal.design.candidates import Candidates
 from jaxcal.design.criteria import Criterion
 from jaxcal.design.planning import Plan, next_poses, plan
 from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
+from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.given_values import is_number
-
-if TYPE_CHECKING:
-    from jaxcal.result.calibration import Calibration
 
 MOST_IMAGES = 1000
 _ENOUGH = 1000

@@ -15,7 +15,7 @@ Information adds up: after n images it is J = prior + sum_i G_i'G_i, and S = J^-
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -24,12 +24,10 @@ from jaxcal.data.poses import check_poses, targets_in_images
 from jaxcal.design.noise import Noise, check_result, used_images
 from jaxcal.diagnostics.image_errors import motion
 from jaxcal.model.unknowns import RIGID, TABLE, block_slice, count_unknowns
+from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.arrays import is_traced
 from jaxcal.runtime.given_values import check_flag, check_made, is_number, real_array
-
-if TYPE_CHECKING:
-    from jaxcal.result.calibration import Calibration
 
 BELIEVED_SD = {"translation": 50.0, "rotation": 0.5, "point": 50.0, "scale": 0.3}
 """Prior SDs before any image (our choice): of X's translation (mm) and rotation (rad), of the

@@ -10,7 +10,7 @@ target's distance from the mid-plane.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -18,12 +18,10 @@ from jaxcal import InputError
 from jaxcal.data.probe import Probe, check_probe
 from jaxcal.diagnostics.image_errors import error_sd
 from jaxcal.diagnostics.sd_by_place import basis_at, log_sd_slopes
+from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Bool, Float
 from jaxcal.runtime.arrays import is_traced
 from jaxcal.runtime.given_values import check_made, is_number, real_array
-
-if TYPE_CHECKING:
-    from jaxcal.result.calibration import Calibration
 
 FEWEST_TO_LEARN = 20
 """Fewest images from which SDs are learned as functions of the place."""
@@ -37,8 +35,6 @@ UNKNOWN_BY = 3.0
 
 def check_result(result: object) -> None:
     """Raise InputError if what a caller gave is not the calibration of one problem."""
-    from jaxcal.result.calibration import Calibration
-
     check_made("result", result, Calibration, "jaxcal.calibrate")
     assert isinstance(result, Calibration)
     if np.ndim(result.image_to_probe) != 2:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -36,11 +35,9 @@ from jaxcal.design.information import (
 from jaxcal.design.noise import SD_RANGE_MM, Noise, check_result
 from jaxcal.diagnostics.directions import direction_in_words
 from jaxcal.diagnostics.uncertainty import mm_at_target
+from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Bool, Float
 from jaxcal.runtime.given_values import check_flag, check_made, real_array, whole_number
-
-if TYPE_CHECKING:
-    from jaxcal.result.calibration import Calibration
 
 _SINGULAR = 1e-10
 """Eigenvalue ratio (scaled units, equal SDs) below which a direction is not determined."""
@@ -253,8 +250,6 @@ def _checked_information(value: object, size: int) -> Float[np.ndarray, "p p"]:
 
 def with_effective_noise(prior: object, candidates: Candidates) -> Candidates:
     """Candidates whose elevational SD is the calibration's effective one."""
-    from jaxcal.result.calibration import Calibration
-
     if not isinstance(prior, Calibration) or candidates.taken is None:
         return candidates
     model = candidates.model

@@ -9,24 +9,22 @@ a law, lateral position and range err by the model's SDs, and every recording is
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from jaxcal import InputError
+from jaxcal.data.problem import Problem
 from jaxcal.data.recording import MINIMUM_IMAGES
 from jaxcal.design.candidates import Candidates
+from jaxcal.design.information import Model
 from jaxcal.design.planning import Plan
 from jaxcal.diagnostics.metrics import reconstruction_precision
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.given_values import LARGEST_SEED, check_made, real_array, whole_number
 from jaxcal.runtime.jax_modes import importing_jax, in_own_modes
-
-if TYPE_CHECKING:
-    from jaxcal.data.problem import Problem
-    from jaxcal.design.information import Model
-    from jaxcal.solvers.names import Method, PriorName
-    from jaxcal.study.laws import LawName
+from jaxcal.solvers.names import Method, PriorName
+from jaxcal.study.laws import LawName
 
 MOST_TRIALS = 100_000
 """Of one call; they are all in memory at once."""

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-from jaxcal import InputError
 from jaxcal.model.unknowns import TABLE, block_slice
+from jaxcal.result.calibration import Calibration, check_one
 from jaxcal.runtime.array_types import AnyArray
 from jaxcal.runtime.arrays import finite_or_none
-
-if TYPE_CHECKING:
-    from jaxcal.result.calibration import Calibration
 
 WORTH = 0.7
 """A kind of further image is advised if it tells at least this share of what the best one tells."""
@@ -55,19 +50,13 @@ def _block_in_words(block: str, part: np.ndarray) -> str:
     return row.oblique.format(*unit)
 
 
-def check_one(result: Calibration) -> None:
-    """Raise InputError for a batch, of which each calibration has words of its own."""
-    if np.ndim(result.mask) != 1:
-        raise InputError("a batch holds many calibrations: take one of them, batch[0]")
-
-
 def observability(result: Calibration) -> dict[str, float | str | None]:
     """The least known direction, and the direction known only from the prior, as plain values.
 
     Raises:
         InputError: of a batch.
     """
-    check_one(result)
+    check_one(result.status_code)
     from_prior = None
     if np.any(result.prior_direction != 0):
         from_prior = direction_in_words(result.prior_direction, result.blocks)

@@ -24,12 +24,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jaxcal import InputError
 from jaxcal.data.poses import quaternions_from_rotations, rotations_from_quaternions
+from jaxcal.data.problem import Problem
 from jaxcal.runtime.array_types import Float
 from jaxcal.solvers.closed_form.reduced_objective import (
     CONSTRAINTS,
@@ -39,9 +39,6 @@ from jaxcal.solvers.closed_form.reduced_objective import (
     reduce,
 )
 from jaxcal.solvers.closed_form.single import descend, feasible, scalar_root
-
-if TYPE_CHECKING:
-    from jaxcal.data.problem import Problem
 
 ODDS = 1e6
 """How many times more probable the data must be with a slip corrected."""

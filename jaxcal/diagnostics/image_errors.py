@@ -14,15 +14,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from jaxcal.data.poses import rotations_from_vectors
+from jaxcal.data.problem import Problem
 from jaxcal.model import unknowns as model
 from jaxcal.model.unknowns import (
     RIGID_UNKNOWNS,
     TINY,
+    Blocks,
     block_slice,
     count_unknowns,
     further_derivatives,
@@ -31,15 +33,11 @@ from jaxcal.model.unknowns import (
     stepped,
     with_prior,
 )
+from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import AnyArray, Float
 from jaxcal.runtime.arrays import array_module, map_arrays
+from jaxcal.solvers.closed_form.single import ClosedForm
 from jaxcal.solvers.plan import TUNED
-
-if TYPE_CHECKING:
-    from jaxcal.data.problem import Problem
-    from jaxcal.model.unknowns import Blocks
-    from jaxcal.result.calibration import Calibration
-    from jaxcal.solvers.closed_form.single import ClosedForm
 
 Array = np.ndarray
 

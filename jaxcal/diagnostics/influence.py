@@ -33,11 +33,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from jaxcal import CalibrationError, InputError
 from jaxcal.diagnostics.image_errors import (
     KINDS,
     ImageErrors,
@@ -48,12 +47,10 @@ from jaxcal.diagnostics.image_errors import (
 )
 from jaxcal.diagnostics.uncertainty import inverses, variances_by_axis
 from jaxcal.model.unknowns import predicted_distance
+from jaxcal.result.calibration import Calibration, check_one, data_of
 from jaxcal.runtime.array_types import Bool, Float, Int
 from jaxcal.runtime.arrays import map_arrays
 from jaxcal.solvers.plan import TUNED
-
-if TYPE_CHECKING:
-    from jaxcal.result.calibration import Calibration
 
 Array = np.ndarray
 
@@ -128,12 +125,8 @@ def influence_of(calibration: Calibration) -> Influence:
         CalibrationError: a calibration without its problem.
         InputError: a batch.
     """
-    if calibration.problem is None:
-        raise CalibrationError(
-            "this calibration does not hold its problem: add it with calibration.with_problem"
-        )
-    if np.ndim(calibration.mask) != 1:
-        raise InputError("a batch holds many calibrations: take one of them")
+    data_of(calibration)
+    check_one(calibration.status_code)
     alone = map_arrays(_first, calibration.numpy())
     with np.errstate(all="ignore"):
         found = whitened_errors(alone)

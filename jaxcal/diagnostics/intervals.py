@@ -26,7 +26,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy import special
@@ -41,14 +41,12 @@ from jaxcal.model.unknowns import (
     measured,
     split_further,
 )
+from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import AnyArray, Float
 from jaxcal.runtime.arrays import array_module, is_traced
 from jaxcal.runtime.given_values import is_number, real_array
 from jaxcal.runtime.jax_modes import traceable
 from jaxcal.solvers.plan import TUNED
-
-if TYPE_CHECKING:
-    from jaxcal.result.calibration import Calibration
 
 DIRECTIONS = 1024
 """Directions over which the distribution of an error is averaged. At a point of the

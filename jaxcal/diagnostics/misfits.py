@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from jaxcal.diagnostics.residual_checks import FEWEST_TO_CHECK
+from jaxcal.result.calibration import Calibration
 from jaxcal.result.findings import MISFITS
 from jaxcal.runtime.array_types import AnyArray
 from jaxcal.runtime.arrays import finite_or_none
-
-if TYPE_CHECKING:
-    from jaxcal.result.calibration import Calibration
 
 MISFIT_SCORE = 3.3
 """A standard normal score beyond this contradicts the noise model. Where the model holds, one data

@@ -14,16 +14,13 @@ References: Lilliefors 1967 (estimated parameters); the limits are from 4,000 si
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jaxcal.diagnostics.residual_checks import FEWEST_TO_CHECK
 from jaxcal.model.distributions import FAMILIES
+from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Float
-
-if TYPE_CHECKING:
-    from jaxcal.result.calibration import Calibration
 
 CONTRADICTED: dict[str, float] = {"uniform": 1.25, "bell": 1.25, "gaussian": 1.25, "student": 1.9}
 """The largest sqrt(n) D for each family of :data:`jaxcal.model.distributions.FAMILIES`."""

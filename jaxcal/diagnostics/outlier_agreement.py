@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,11 +16,9 @@ from jaxcal.data.problem import Problem
 from jaxcal.diagnostics.image_errors import ImageErrors
 from jaxcal.model.image_points import distance
 from jaxcal.model.unknowns import RIGID
+from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Float
 from jaxcal.solvers.closed_form.single import ClosedForm, solve_problem
-
-if TYPE_CHECKING:
-    from jaxcal.result.calibration import Calibration
 
 FEWEST_LEFT_OUT = 8
 """With fewer images left out there is no second group."""

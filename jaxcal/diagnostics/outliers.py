@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from statistics import NormalDist
-from typing import TYPE_CHECKING, Protocol, TypedDict, runtime_checkable
+from typing import Protocol, TypedDict, runtime_checkable
 
 import numpy as np
 
 from jaxcal.diagnostics.image_errors import KINDS
 from jaxcal.diagnostics.residual_checks import FEWEST_TO_CHECK
+from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import AnyArray
 from jaxcal.runtime.arrays import finite_or_none
-
-if TYPE_CHECKING:
-    from jaxcal.result.calibration import Calibration
 
 SUSPECTED = 0.02
 """Half of this is the share of recordings with Gaussian errors in which chance alone makes an

@@ -22,8 +22,6 @@ normality; Gelman et al. 2013, chapter 6 (posterior predictive checks).
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from jaxcal.data.poses import rotations_from_vectors
@@ -37,14 +35,13 @@ from jaxcal.diagnostics.image_errors import (
 )
 from jaxcal.diagnostics.sd_by_place import relative_sd
 from jaxcal.diagnostics.uncertainty import Uncertainty, inverses
-from jaxcal.model.thresholds import CUT, FEW_IMAGES, FEWEST_IMAGES, MAD, RELATIVE_FLOOR
+from jaxcal.model.outlying import stands_out
+from jaxcal.model.thresholds import FEWEST_IMAGES, MAD, RELATIVE_FLOOR
 from jaxcal.model.unknowns import block_slice, further_derivatives, measured
+from jaxcal.result.calibration import Calibration
 from jaxcal.result.findings import Inspection
-from jaxcal.runtime.array_types import AnyArray, Bool, Float
+from jaxcal.runtime.array_types import AnyArray, Float
 from jaxcal.solvers.plan import TUNED
-
-if TYPE_CHECKING:
-    from jaxcal.result.calibration import Calibration
 
 Array = np.ndarray
 
@@ -167,18 +164,6 @@ def medians(values: Float[Array, "k n c"], weight: Float[Array, "k n"]) -> Float
     values = np.where(used[..., None] & ~np.isnan(values), values, np.inf)
     middle = np.maximum((used.sum(axis=1) + 1) // 2 - 1, 0)
     return np.take_along_axis(np.sort(values, axis=1), middle[:, None, None], axis=1)[:, 0]
-
-
-def stands_out(studentised: Float[Array, "k n 3"], kept: Float[Array, "k n"]) -> Bool[Array, "k n"]:
-    """Whether an image's errors are larger than the images in use can explain.
-
-    A median of a dozen images is itself uncertain, so the limit is wider with few images. It is not
-    widened for images that were left out (:func:`jaxcal.solvers.consensus.stands_out`).
-    """
-    count = np.maximum(kept.sum(axis=1, keepdims=True), 1.0)
-    few = np.sqrt(np.maximum(FEW_IMAGES / count, 1.0))
-    limit = CUT * np.where(kept > 0, few, 1.0)
-    return np.any(np.abs(studentised) > limit[..., None], axis=2)
 
 
 def check_noise_model(

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import fields
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from jaxcal import CalibrationError
 from jaxcal.diagnostics.image_errors import ImageErrors
 from jaxcal.diagnostics.residual_checks import inspect
 from jaxcal.diagnostics.uncertainty import assess
+from jaxcal.result.calibration import Calibration, data_of
 from jaxcal.result.findings import Summary
 from jaxcal.runtime.arrays import map_arrays
-
-if TYPE_CHECKING:
-    from jaxcal.result.calibration import Calibration
 
 Array = np.ndarray
 
@@ -32,11 +29,7 @@ def summarise(calibration: Calibration) -> Summary:
     Raises:
         CalibrationError: a calibration without its problem.
     """
-    if calibration.problem is None:
-        raise CalibrationError(
-            "this calibration does not hold its problem, without which there are no diagnostics: "
-            "add it with calibration.with_problem(problem)"
-        )
+    data_of(calibration)
     batch = np.shape(calibration.mask)[:-1]
     axes = len(batch)
     eps = float(np.finfo(np.asarray(calibration.covariance).dtype).eps)

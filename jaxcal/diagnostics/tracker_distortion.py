@@ -22,15 +22,12 @@ References: Harville 1977 (restricted likelihood); Laird and Ware 1982 (expectat
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jaxcal.diagnostics.image_errors import ImageErrors
 from jaxcal.model.unknowns import block_slice
 from jaxcal.runtime.array_types import Bool, Float
-
-if TYPE_CHECKING:
-    from jaxcal.diagnostics.image_errors import ImageErrors
 
 Array = np.ndarray
 

@@ -25,20 +25,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from jaxcal.diagnostics.image_errors import ImageErrors, Whitened, quadratic
 from jaxcal.model.thresholds import LARGEST_ELEVATION
-from jaxcal.model.unknowns import TABLE, block_slice
+from jaxcal.model.unknowns import TABLE, Blocks, block_slice
+from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import AnyArray, Bool, Float
 from jaxcal.runtime.arrays import array_module
 from jaxcal.solvers.plan import DEFAULT_MAX_ELEVATION_MM, TUNED
-
-if TYPE_CHECKING:
-    from jaxcal.model.unknowns import Blocks
-    from jaxcal.result.calibration import Calibration
 
 Array = np.ndarray
 

@@ -33,18 +33,15 @@ References: Wilks 1938; Andrews 1993 (a change at an unknown place).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jaxcal.diagnostics import tracker_distortion
 from jaxcal.diagnostics.image_errors import ImageErrors, Whitened
+from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Bool, Float
 from jaxcal.runtime.arrays import map_arrays
 from jaxcal.solvers.plan import TUNED
-
-if TYPE_CHECKING:
-    from jaxcal.result.calibration import Calibration
 
 Array = np.ndarray
 

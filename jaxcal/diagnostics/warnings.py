@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-from jaxcal.diagnostics.directions import check_one, observability
+from jaxcal.diagnostics.directions import observability
 from jaxcal.diagnostics.image_errors import KINDS
 from jaxcal.diagnostics.misfits import misfits
 from jaxcal.diagnostics.outliers import listed_outliers, outliers, suspects_in_words
 from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
+from jaxcal.result.calibration import Calibration, check_one
 from jaxcal.solvers.plan import TUNED
-
-if TYPE_CHECKING:
-    from jaxcal.result.calibration import Calibration
 
 IMPLAUSIBLE_RMS_MM = 10.0
 """Residuals with a larger root mean square do not come from a target within the beam."""
@@ -35,7 +31,7 @@ def warnings(result: Calibration) -> list[str]:
     Raises:
         InputError: of a batch.
     """
-    check_one(result)
+    check_one(result.status_code)
     if result.status == "failed":
         return ["the solve failed: the result holds no usable numbers"]
     if result.wrong_frames is not None:

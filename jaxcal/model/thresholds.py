@@ -8,12 +8,6 @@ LARGEST_ELEVATION = 0.95
 MINIMUM_SELF_TUNING = 8
 """With fewer used images the residuals cannot determine three SDs besides nine unknowns."""
 
-CUT = 6.0
-"""SDs beyond which an image stands out. Heavy tails (Student's t4) put 0.3 % of images there."""
-
-FEW_IMAGES = 30
-"""With fewer images in use, n, the limit is wider by sqrt(30 / n): 9.5 SDs for a dozen."""
-
 FEWEST_IMAGES = 8
 """With fewer used images nothing is left out: they cannot outvote one another."""
 

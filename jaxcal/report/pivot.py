@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from jaxcal.calibration.pivot import AXES, Pivot
 from jaxcal.diagnostics.outliers import outlier_reasons, outliers
 from jaxcal.report.record import plain
 from jaxcal.runtime.messages import counted
 
-if TYPE_CHECKING:
-    from jaxcal.calibration.pivot import Pivot
-
 
 def pivot_record(result: Pivot) -> dict[str, Any]:
     """What ``jaxcal pivot --json`` prints, as plain values."""
-    from jaxcal.calibration.pivot import AXES
-
     mask, covariance = np.asarray(result.mask), np.asarray(result.covariance)
     return plain(
         {

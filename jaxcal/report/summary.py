@@ -12,10 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from jaxcal import CalibrationError, InputError
 from jaxcal.data.recording import Images, Recording
 from jaxcal.report.record import calibration_record
-from jaxcal.result.calibration import Calibration
+from jaxcal.result.calibration import Calibration, check_one, data_of
 
 
 def recording_of(calibration: Calibration) -> Recording:
@@ -26,13 +25,8 @@ def recording_of(calibration: Calibration) -> Recording:
         InputError: a batch.
     """
     answer = calibration.numpy()
-    problem = answer.problem
-    if problem is None:
-        raise CalibrationError(
-            "this calibration does not hold its problem: add it with calibration.with_problem"
-        )
-    if np.ndim(answer.mask) != 1:
-        raise InputError("a batch holds many calibrations: take one of them, batch[0]")
+    problem = data_of(answer)
+    check_one(answer.status_code)
     mask = np.asarray(problem.mask) > 0
     used = mask[:, None]
     spacing = None

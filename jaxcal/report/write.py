@@ -63,13 +63,7 @@ NAMES = (
 
 @contextmanager
 def prepare_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Make a folder and its missing parents, and check that a report can be written to it.
-
-    This comes before other work begins.
-
-    Yields:
-        The folder. If the block raises an error, folders that were made here and are still empty
-        are removed again.
+    """As :func:`made_folder`, before other work begins, for a report.
 
     Raises:
         InputError: files of a report's names are there, but no report.

@@ -15,6 +15,7 @@ from jaxcal.data.probe import Probe
 from jaxcal.data.problem import Problem
 from jaxcal.model.distributions import OffsetLaw
 from jaxcal.model.unknowns import TABLE, Blocks, Values, block_slice, in_image, with_prior
+from jaxcal.result.findings import Inspection, Summary
 from jaxcal.result.saved import check_target, dated
 from jaxcal.result.transform import AppliedPoints, ImageTransform, SaveFormat
 from jaxcal.runtime.array_types import AnyArray, Bool, Float, Int
@@ -23,8 +24,6 @@ from jaxcal.solvers.convergence import Convergence
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from jaxcal.result.findings import Inspection, Summary
 
 
 class Status(enum.IntEnum):
@@ -407,8 +406,7 @@ class Calibration:
         """
         from jaxcal.diagnostics.frame_checks import wrong_frames
 
-        if self._concrete(self.mask).ndim != 1:
-            raise InputError("a batch holds many calibrations: take one of them, batch[0]")
+        check_one(self._concrete(self.status_code))
         if self.problem is None:
             return None
         return wrong_frames(replace(self.problem, mask=self.mask), self.blocks)
@@ -459,8 +457,7 @@ class Calibration:
         from jaxcal.diagnostics.intervals import range_of_row_zero
 
         answer = self.numpy()
-        if answer.image_to_probe.ndim != 2:
-            raise InputError("a batch holds many transforms: take one of its calibrations")
+        check_one(answer.status_code)
         scale = answer.scale_mm_per_px
         known = np.isfinite(answer.unknowns_covariance).all()
         origin, factor = range_of_row_zero(answer)
@@ -613,3 +610,23 @@ class Calibration:
                 "use the arrays (status_code, converged, ...) there, and the rest outside"
             )
         return np.asarray(value)
+
+
+def check_one(status_code: Int[AnyArray, "*batch"]) -> None:
+    """Raise InputError where each calibration of a batch has a status."""
+    if np.ndim(status_code):
+        raise InputError("a batch holds many calibrations: take one of them, batch[0]")
+
+
+def data_of(calibration: Calibration) -> Problem:
+    """The data that were solved.
+
+    Raises:
+        CalibrationError: they are not held.
+    """
+    if calibration.problem is None:
+        raise CalibrationError(
+            "this needs the data, and this calibration does not hold its problem: add it with "
+            "calibration.with_problem(problem)"
+        )
+    return calibration.problem

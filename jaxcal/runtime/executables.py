@@ -179,10 +179,13 @@ def run(
     """
     leaves: list[Any] = []
     described = describe(arguments, leaves)
+    name = function
+    if not isinstance(function, str):
+        name = f"{function.__module__}:{function.__qualname__}"
     device = _device(leaves)
     key = json.dumps(
         {
-            "function": _name_of(function),
+            "function": name,
             "plan": describe(plan, []),
             "arguments": described,
             "leaves": [[leaf.dtype.name, list(leaf.shape)] for leaf in leaves],
@@ -219,12 +222,6 @@ def run(
         program = compiled()
         _remember(key, program)
     return program(leaves, convert)
-
-
-def _name_of(function: str | Callable[..., Any]) -> str:
-    if isinstance(function, str):
-        return function
-    return f"{function.__module__}:{function.__qualname__}"
 
 
 def _imported(function: str | Callable[..., Any]) -> Callable[..., Any]:

@@ -39,9 +39,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxcal.data.problem import Problem
+from jaxcal.model.outlying import stands_out
 from jaxcal.model.parameters import Parameters, retract
 from jaxcal.model.residuals import measured_points, measurement_residual
-from jaxcal.model.thresholds import CUT, FEW_IMAGES, FEWEST_IMAGES, MAD, RELATIVE_FLOOR
+from jaxcal.model.thresholds import FEWEST_IMAGES, MAD, RELATIVE_FLOOR
 from jaxcal.model.unknowns import Blocks, count_unknowns
 from jaxcal.solvers import dense
 from jaxcal.solvers.proposals import SUBSET, linear_proposals, nominal, subset_weights
@@ -116,7 +117,8 @@ def find_consensus(problem: Problem, model: ConsensusModel) -> Float[Array, " n"
         total = jnp.sum(jnp.log(jnp.maximum(scale, 1e-9)))
         return jnp.where(jnp.isfinite(total), total, jnp.inf)
 
-    count = finalists(used.shape[0])
+    # With few images, a clean subset need not score best.
+    count = int(np.clip(400 // used.shape[0], 6, 24))
     _, best = jax.lax.top_k(-jax.vmap(score)(proposed)[1:], count)
     # The first candidate takes all images as good; it competes with those that leave some out.
     chosen = jnp.concatenate([jnp.zeros(1, best.dtype), best + 1])
@@ -127,11 +129,6 @@ def find_consensus(problem: Problem, model: ConsensusModel) -> Float[Array, " n"
     winner = jnp.argmin(cost)
     enough = (jnp.sum(used) >= FEWEST_IMAGES) & jnp.isfinite(cost[winner])
     return jnp.where(enough, keep[winner], used)
-
-
-def finalists(images: int) -> int:
-    """How many proposals to go on with: with few images, a clean subset need not score best."""
-    return int(np.clip(400 // images, 6, 24))
 
 
 def _finish(
@@ -156,7 +153,7 @@ def _finish(
         squared = jnp.sum((errors / sigma) ** 2, axis=1)
         nearest = used * (squared <= quantile(squared, used, CONCENTRATION))
         studentised = _studentise(errors, leverage, sigma, basis)
-        fits = used * (1 - stands_out(studentised, basis))
+        fits = used * ~stands_out(studentised, basis)
         # If fewer than ``fewest`` fit, go on with the images that stand out least.
         largest = jnp.max(jnp.abs(studentised), axis=1)
         least = used * (largest <= quantile(largest, used, fewest / jnp.sum(used)))
@@ -200,18 +197,6 @@ def studentised_errors(
     errors, jacobian = linearise(parameters, problem, model)
     sigma = _robust(errors, keep, model)
     return _studentise(errors, _leverage(jacobian, sigma, keep), sigma, keep)
-
-
-def stands_out(studentised: Float[Array, "n 3"], keep: Float[Array, " n"]) -> Float[Array, " n"]:
-    """1 where an image's errors are larger than the images in use can explain.
-
-    A median of a dozen images is itself uncertain, so the limit is wider with few images. It is
-    not wider for an image that was left out: the prediction from few images is uncertain, too, and
-    an outlier that returned through the wide limit would bring the others back with it.
-    """
-    few = jnp.sqrt(jnp.maximum(FEW_IMAGES / jnp.maximum(jnp.sum(keep), 1.0), 1.0))
-    limit = CUT * jnp.where(keep > 0, few, 1.0)
-    return jnp.any(jnp.abs(studentised) > limit[:, None], axis=1).astype(keep.dtype)
 
 
 def _robust(

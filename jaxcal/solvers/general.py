@@ -121,7 +121,8 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
 
     def _before(self, start: Flat, value: Any, aux: Any) -> tuple[Descent, Rounding, Any]:
         dtype = start.shared.dtype
-        state = Descent.before(start, jnp.zeros(1, dtype), self.damping)
+        number = jnp.zeros(1, dtype)
+        state = Descent.first(start, number, self.damping, exact_next=number)
         rounding = jnp.finfo(dtype).eps * jnp.max(jnp.abs(ravel_pytree(value)[0]))[None]
         return state, Rounding(rounding, 0.0 * rounding), aux
 

@@ -116,7 +116,7 @@ class LoopState(Minimum):
 
     @classmethod
     def first(
-        cls, start: Any, number: Float[Array, " batch"], damping: float, trace: int, **own: Any
+        cls, start: Any, number: Float[Array, " batch"], damping: float, trace: int = 0, **own: Any
     ) -> Any:
         """The state before the first evaluation.
 
@@ -191,13 +191,6 @@ class Descent(LoopState):
     """
 
     exact_next: Float[Array, " batch"]
-
-    @classmethod
-    def before(
-        cls, start: Any, number: Float[Array, " batch"], damping: float, *, trace: int = 0
-    ) -> Descent:
-        """The state before the first evaluation, as :meth:`first`."""
-        return cls.first(start, number, damping, trace, exact_next=number)
 
 
 def empty_trace(length: int, number: Float[Array, " batch"]) -> Float[Array, "trace batch"] | None:
@@ -410,7 +403,8 @@ def minimise(
             decrease_exact=decrease_exact,
         )
 
-    begun = Descent.before(start, jnp.zeros_like(images.mask[:, 0]), damping, trace=trace)
+    number = jnp.zeros_like(images.mask[:, 0])
+    begun = Descent.first(start, number, damping, trace, exact_next=number)
     data = (observation, images, medium, rounding)
     ended = until_done(one, begun, data, lambda s: s.active, together=together)
     return Minimum(*(getattr(ended, field.name) for field in fields(Minimum)))

@@ -27,17 +27,13 @@ SUBSET = 6
 SEED = 20261121
 
 
-def proposals(images: int) -> int:
-    """How many subsets to try: more with fewer images, because fewer subsets are clean then."""
-    return int(np.clip(12_800 // images, FEWEST_PROPOSALS, MOST_PROPOSALS))
-
-
 def subset_weights(used: Float[Array, " n"], size: int) -> Float[Array, "k n"]:
     """Weights (0 or 1) of the proposals' subsets, each of ``size`` used images.
 
     The draws are constants of the program: the same problem gives the same answer everywhere.
     """
-    count = proposals(used.shape[0])
+    # With fewer images, fewer subsets are clean.
+    count = int(np.clip(12_800 // used.shape[0], FEWEST_PROPOSALS, MOST_PROPOSALS))
     draws = np.random.default_rng(SEED).random((count, used.shape[0]))
     order = jnp.where(used > 0, jnp.asarray(draws, used.dtype), 2.0)
 

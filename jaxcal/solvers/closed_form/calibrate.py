@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 from jaxcal.data.problem import Problem, as_batch, check_shapes
+from jaxcal.data.recording import Images, Recording
 from jaxcal.model.unknowns import unknown_names
 from jaxcal.runtime.arrays import is_traced
 from jaxcal.solvers.closed_form.single import ClosedForm, solve_problem
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from jaxcal.data.recording import Images, Recording
 
 
 def calibrate_closed_form(

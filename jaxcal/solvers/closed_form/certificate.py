@@ -6,12 +6,13 @@ where that proves nothing, the one of :mod:`jaxcal.solvers.closed_form.rotation_
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.data.problem import as_problem
+from jaxcal.data.problem import Problem, as_problem
+from jaxcal.data.recording import Images, Recording
 from jaxcal.model.unknowns import unknown_names
 from jaxcal.runtime.array_types import AnyArray, Float
 from jaxcal.runtime.arrays import is_traced
@@ -24,12 +25,6 @@ from jaxcal.solvers.closed_form.reduced_objective import (
     tolerance,
 )
 from jaxcal.solvers.closed_form.rotation_relaxation import lower_bound
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from jaxcal.data.problem import Problem
-    from jaxcal.data.recording import Images, Recording
 
 ORTHONORMAL = 1e-6
 """A transform whose rotation stretches by more is refused; less is rounding, and is removed."""

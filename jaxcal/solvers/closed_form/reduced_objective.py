@@ -32,16 +32,14 @@ Barfoot, arXiv:2308.07275.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from jaxcal import InputError
+from jaxcal.data.problem import Problem
 from jaxcal.data.recording import MINIMUM_IMAGES
 from jaxcal.runtime.array_types import Bool, Float
-
-if TYPE_CHECKING:
-    from jaxcal.data.problem import Problem
 
 RANK_TOLERANCE = 1e-11
 """Singular values below this share of the largest possible one count as zero."""

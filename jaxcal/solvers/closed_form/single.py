@@ -31,11 +31,13 @@ from __future__ import annotations
 import itertools
 from dataclasses import replace
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from jaxcal.data.poses import rotations_from_quaternions
+from jaxcal.data.problem import Problem
+from jaxcal.model.unknowns import Blocks
 from jaxcal.runtime.array_types import Bool, Float, HeldArray
 from jaxcal.runtime.arrays import array_tree, assembled
 from jaxcal.solvers.closed_form.reduced_objective import (
@@ -49,10 +51,6 @@ from jaxcal.solvers.closed_form.reduced_objective import (
     tolerance,
 )
 from jaxcal.solvers.closed_form.rotation_relaxation import lower_bound
-
-if TYPE_CHECKING:
-    from jaxcal.data.problem import Problem
-    from jaxcal.model.unknowns import Blocks
 
 Numbers = Any
 """A number, or for a batch an array of them."""
