@@ -135,12 +135,15 @@ def test_a_frame_of_before_the_probe_came_to_rest_is_not_measured(tmp_path, mome
                 session.image_after(robot.clock.now())
                 stage = ProbeStage(session, motion, PLAN.targets, lambda kind, text: None)
                 stage.go_to(2)
+                bench = stage.image_bench(2)
                 if moment == "never":
+                    assert bench.read(1).heard
                     place, _ = stage.locate(2)
                     np.testing.assert_allclose(place, [3.0, 45.0], atol=0.3)
                     return
-                with pytest.raises(StaleError, match="before the probe came to rest"):
-                    stage.locate(2)
+                for look in (stage.locate, bench.read):
+                    with pytest.raises(StaleError, match="before the probe came to rest"):
+                        look(2)
 
 
 def test_images_of_a_machine_that_also_sends_rf(tmp_path):
