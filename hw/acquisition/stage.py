@@ -183,7 +183,8 @@ class ProbeStage:
         """Check an image that shows something: an empty one may be the same in every pose."""
         if self._session.is_of_the_way(image):
             raise StaleError(
-                "the image is still that from before the probe came to rest: is the machine frozen?",
+                "the image is still that from before the probe came to rest: is the machine "
+                "frozen?",
                 device="ultrasound",
             )
 
