@@ -274,7 +274,8 @@ class Session:
             self._measure_echo_delay()
             problem = self._clock_of("active echo")
             if isinstance(problem, str):
-                raise DeviceError(f"{problem}: times of flight are wrong", device="active echo")
+                text = f"{problem}: times of flight may be wrong"
+                raise DeviceError(text, device="active echo")
         found: list[EchoFrame] = []
         with self._changed:
             while True:
@@ -436,7 +437,8 @@ class Session:
         if abs(fit.drift) * span > _MOST_DRIFT * span + self.clock.patience(_STEP_S):
             rate = 1.0 / max(1.0 + fit.drift, 1e-12)
             return (
-                f"its clock was set, or counts {rate:.4g} s a second by the clock of this computer"
+                f"its clock was set, or counts {rate:.4g} s a second by the clock of this "
+                "computer, or its data come later and later"
             )
         return fit
 
