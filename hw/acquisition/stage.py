@@ -158,11 +158,35 @@ class ProbeStage:
         Args:
             row: of the plan; it says where the target should be.
             credible: respond only where the segmentation finds the target.
+
+        Its ``read`` raises a StaleError as :meth:`locate` does: by a frozen image the search would
+        go on to the end of its reach.
         """
-        place, within = self._expected_px(row, self.whole_frame())
+        image = self.whole_frame()
+        place, within = self._expected_px(row, image)
+
+        def see() -> np.ndarray:
+            nonlocal image
+            image = self.whole_frame()
+            return image.array
+
         return ImageBench(
-            self.move, lambda: self.whole_frame().array, place, within, credible=credible
+            self.move,
+            see,
+            place,
+            within,
+            credible=credible,
+            check=lambda: self._check_new(image),
         )
+
+    def _check_new(self, image: Image) -> None:
+        """Check an image that shows something: an empty one may be the same in every pose."""
+        if self._session.is_of_the_way(image):
+            raise StaleError(
+                "the image is still that from before the probe came to rest: is the machine "
+                "frozen?",
+                device="ultrasound",
+            )
 
     def _expected_px(self, row: int, image: Image) -> tuple[tuple[float, float], float]:
         """Where the target should be in an image, and how far from there to look, px."""
@@ -186,12 +210,7 @@ class ProbeStage:
             place, within = self._expected_px(row, image)
             found = localise(image.array, "cross", near=place, within_px=within)
             if found.found[0]:
-                if self._session.is_of_the_way(image):
-                    raise StaleError(
-                        "the image is still that from before the probe came to rest: is the "
-                        "machine frozen?",
-                        device="ultrasound",
-                    )
+                self._check_new(image)
                 contrast = float(found.contrast_db[0])
                 columns = image.array.shape[1]
                 return place_of(found.position[0], image.spacing_mm, columns), contrast

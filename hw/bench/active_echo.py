@@ -66,6 +66,7 @@ class EchoFaults:
         missed_lines: share of the frames in which a line trigger is missed.
         stale: no frame triggers: commands are answered, frames do not come.
         mute: nothing is said at all, port open.
+        clock: its counter runs so many times as fast as it says.
     """
 
     crc_errors: float = 0.0
@@ -73,6 +74,7 @@ class EchoFaults:
     missed_lines: float = 0.0
     stale: bool = False
     mute: bool = False
+    clock: float = 1.0
 
 
 class AuspisEmulator:
@@ -234,11 +236,12 @@ class AuspisEmulator:
         if not self._streaming or faults.mute or self._random.random() < faults.missed_triggers:
             return
         seconds, amplitude = self._echo(t, self._threshold)
+        clock_hz = self._clock_hz * faults.clock
         packet = EchoPacket(
             frame=frame % 2**32,
-            ticks=int(t * self._clock_hz) % 2**64,
+            ticks=int(t * clock_hz) % 2**64,
             threshold=self._threshold,
-            tof_ticks=to_ticks(seconds, self._clock_hz)[:lines],
+            tof_ticks=to_ticks(seconds, clock_hz)[:lines],
             amplitude=np.clip(np.nan_to_num(np.rint(amplitude)), 0, 0xFFFF).astype(np.uint16)[
                 :lines
             ],

@@ -54,6 +54,7 @@ _MAX_WAITING = 1 << 16
 _ROBOT_MESSAGE = 20
 _CLOCK_AHEAD_S = 1000.0
 """The controller's time less bench time."""
+_MEASURED = frozenset({"actual_TCP_pose", "actual_TCP_speed", "actual_q", "actual_qd"})
 _LATE_S = 1.0
 _HELD_S = 0.01
 """Bench time after which this process counts as held up by the machine."""
@@ -72,6 +73,8 @@ class _Connection:
         self.complete = True
         """Whether every variable of the output recipe exists."""
         self.started = False
+        self.asked_s = 0.0
+        """When it was asked to start."""
 
 
 class RtdeServer:
@@ -116,6 +119,8 @@ class RtdeServer:
         )
         self._wake, self._woken = socket.socketpair()
         self._muted = self._answers_lost = False
+        self._frozen: dict[str, tuple[float, ...] | float | int] = {}
+        self._stamps = _CLOCK_AHEAD_S, 1.0
         self._running = False
         self._thread: threading.Thread | None = None
 
@@ -177,6 +182,8 @@ class RtdeServer:
         - ``tcp_offset`` (m, rad), ``payload`` (kg and, or not, its centre of gravity, m),
           ``speed_slider`` (0 to 1): other settings at the pendant;
         - ``overspeed`` (factor): motions from now on are so many times as fast as commanded;
+        - ``freeze`` (on): pose, speed and joints stay what they were, in packets with new stamps;
+        - ``stamps`` (s, rate): its time stamps are ahead of bench time by so much, and go so fast;
         - ``dashboard`` (text): it answers with this text, with "" not at all, with None as usual.
 
         Returns:
@@ -220,6 +227,11 @@ class RtdeServer:
                 program.speed_fraction = float(fraction)
             case ["overspeed", factor]:
                 program.overspeed = float(factor)
+            case ["freeze", on]:
+                now = self._values(t)
+                self._frozen = {name: now[name] for name in _MEASURED & now.keys()} if on else {}
+            case ["stamps", ahead_s, rate]:
+                self._stamps = float(ahead_s), float(rate)
             case ["dashboard", answer]:
                 self._dashboard_says = answer
             case _:
@@ -384,6 +396,9 @@ class RtdeServer:
             if len(connection.waiting) > _MAX_WAITING:
                 self.skipped += 1
                 continue
+            if t < connection.asked_s - 1.0 / self.frequency_hz:
+                # Only this process, held up, makes packets of the past.
+                continue
             for name, offset, code in connection.outputs:
                 value = values[name]
                 if isinstance(value, tuple):
@@ -396,8 +411,9 @@ class RtdeServer:
         """The variables that change; all others stay zero."""
         program, arm = self.controller, self.arm
         raw, velocity = arm.raw(t), arm.velocity(t)
+        ahead_s, rate = self._stamps
         values: dict[str, tuple[float, ...] | float | int] = {
-            "timestamp": _CLOCK_AHEAD_S + t,
+            "timestamp": ahead_s + rate * t,
             "actual_TCP_pose": raw,
             "target_TCP_pose": raw,
             "actual_TCP_speed": velocity,
@@ -422,7 +438,7 @@ class RtdeServer:
             values[f"output_int_register_{k}"] = program.int_out[k]
         for k in range(6):
             values[f"output_double_register_{k}"] = program.double_out[k]
-        return values
+        return values | self._frozen
 
     def _messages(self, connection: _Connection) -> None:
         data = connection.received
@@ -455,6 +471,7 @@ class RtdeServer:
                 return self._set_inputs(connection, payload)
             case "S" | "P":
                 connection.started = chr(kind) == "S" and connection.complete
+                connection.asked_s = self.clock.now()
                 return bytes([connection.complete or chr(kind) == "P"])
             case "U":
                 self._take(connection, payload)

@@ -37,6 +37,10 @@ _LATEST_S = 0.4
 _SAME_S = 1e-6
 _KEPT = 1024
 _ONE_CLOCK_S = 60.0
+_SET_S = 0.3
+"""Neither delays nor the drift of two clocks change the time between them by so much."""
+_SECONDS = 20.0
+"""Time stamps that run so many times too fast or too slow are not in seconds."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +119,14 @@ class PosedImages:
         stamps = [self._waiting[0][0].t_device]
         stamps += [self._samples[name][0].t_device for name in self._needed]
         apart = np.ptp(stamps) if np.isfinite(stamps).all() else np.inf
-        self.by_arrival = bool(apart > _ONE_CLOCK_S)
+        came = np.ptp([(image.t_device, image.t_host) for image, _ in self._waiting], axis=0)
+        in_seconds = came[1] < _MORE_S / 2 or 1 / _SECONDS < came[0] / came[1] < _SECONDS
+        self.by_arrival = bool(apart > _ONE_CLOCK_S or not in_seconds)
+        first = self._waiting[0][0]
+        self._ahead = {
+            name: _ahead(first, first.t_host, self._samples[name][0]) for name in self._needed
+        }
+        """By how much the images' clock was ahead of that of a transform."""
 
     @property
     def behind(self) -> int:
@@ -194,7 +205,7 @@ class PosedImages:
         moment = image.t_host if self.by_arrival else image.t_device
         pose = np.eye(4)
         for name, (_, inverted) in zip(self._needed, self._steps, strict=True):
-            found = self._at(name, moment - self._lag, late)
+            found = self._at(name, image, moment - self._lag, late)
             if found is None:
                 return None
             if isinstance(found, str):
@@ -202,11 +213,13 @@ class PosedImages:
             pose = (inverse_poses(found[None])[0] if inverted else found) @ pose
         return PosedImage(image, moment, pose)
 
-    def _at(self, name: str, moment: float, late: bool) -> np.ndarray | str | None:
+    def _at(self, name: str, image: Image, moment: float, late: bool) -> np.ndarray | str | None:
         samples = self._samples[name]
         before: Transform | None = None
         for sample in reversed(samples):
             stamp = sample.t_host if self.by_arrival else sample.t_device
+            if stamp <= moment + _SAME_S and self._was_set(name, image, sample):
+                return f"the clock of the images, or of {name}, was set: start anew"
             if abs(stamp - moment) <= _SAME_S:
                 return sample.matrix if sample.valid else f"{name} is not tracked"
             if stamp < moment:
@@ -223,6 +236,21 @@ class PosedImages:
                 )[0]
             before = sample
         return f"{name} began after this image"
+
+    def _was_set(self, name: str, image: Image, sample: Transform) -> bool:
+        """Whether the clocks of image and transform differ by another time than at the start."""
+        if self.by_arrival:
+            return False
+        most = _SET_S + abs(self._lag)
+        return all(
+            abs(_ahead(image, t, sample) - self._ahead[name]) > most
+            for t in (image.t_host, image.prompt_s)
+        )
+
+
+def _ahead(image: Image, came: float, sample: Transform) -> float:
+    """By how much the image's clock is ahead of the transform's, where the image came then, s."""
+    return (image.t_device - came) - (sample.t_device - sample.t_host)
 
 
 def pose_at_arrival(images: Iterable[PosedImage], t: float) -> Float[np.ndarray, "4 4"] | bool:

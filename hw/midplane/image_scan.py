@@ -47,6 +47,7 @@ class ImageBench:
         within_px: look no farther from there.
         credible: answer only where :func:`jaxcal.data.segmentation.image.localise` finds the
             target; it takes longer than the brightest place.
+        check: called when the last frame shows something; raises if that frame cannot be trusted.
     """
 
     def __init__(
@@ -57,8 +58,9 @@ class ImageBench:
         within_px: float,
         *,
         credible: bool = False,
+        check: Callable[[], None] = lambda: None,
     ) -> None:
-        self._move, self._see = move, see
+        self._move, self._see, self._check = move, see, check
         self._expected, self._within = expected_px, within_px
         self._credible = credible
 
@@ -80,7 +82,10 @@ class ImageBench:
             found = localise(frame, "cross", near=self._expected, within_px=self._within)
             if not found.found[0]:
                 return 0.0
-        return brightest_intensity(frame, self._expected, self._within)
+        intensity = brightest_intensity(frame, self._expected, self._within)
+        if intensity > 0:
+            self._check()
+        return intensity
 
 
 def brightest_intensity(

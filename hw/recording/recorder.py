@@ -322,7 +322,9 @@ class Recorder:
         if self._closed:
             return
         if self.error is None and not self._ended:
-            self._note_drops()
+            # A full queue has no room for it; the writer must end all the same.
+            with suppress(OutputError):
+                self._note_drops()
         self._stop()
         if self.error is not None:
             raise self.error
@@ -394,7 +396,11 @@ class Recorder:
             self._ending = self._ended = True
             self._changed.notify_all()
         self._feeder.join(_ENDING_S)
-        if not finish(self._process, _ENDING_S):
+        stuck = self._feeder.is_alive()
+        if stuck:
+            # It takes no data: to close its pipe would wait for the feeder, without end.
+            self._process.kill()
+        if not finish(self._process, _ENDING_S) or stuck:
             self._fail(OutputError(f"{self.path}: the writer did not end and was stopped"))
         self._listener.join(_ENDING_S)
         if self._process.stdout is not None:

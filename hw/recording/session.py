@@ -21,15 +21,15 @@ from itertools import pairwise
 
 import numpy as np
 
-from hw.active_echo.device import SILENT, ActiveEcho, EchoFrame, median_of
+from hw.active_echo.device import SILENT, ActiveEcho, EchoFrame, EchoStatistics, median_of
 from hw.recording.recorder import Recorder
 from hw.robot.stream import PoseSample, PoseStream
 from hw.runtime.errors import DeviceError, StaleError
 from hw.runtime.rigid import apart
 from hw.setup.description import Setup
-from hw.ultrasound.receiver import Image, UltrasoundStream
+from hw.ultrasound.receiver import Image, UltrasoundStatistics, UltrasoundStream
 from jaxcal import CalibrationError
-from jaxcal.data.timing import fit_clock
+from jaxcal.data.timing import ClockFit, fit_clock
 
 _PERIOD_WALL_S = 0.005
 # Rows are written in batches: a write costs a millisecond, however many rows it has.
@@ -39,7 +39,12 @@ _MOVED_MM = 0.3
 """An arm whose pose changes by more is not at rest; a degree counts as a mm."""
 DELAY_S = 10.0
 """After so many bench seconds the delay of the echo frames is measured again."""
-_LEAST_STAMPS, _MOST_STAMPS = 20, 20_000
+_LEAST_STAMPS, _MOST_STAMPS, _MOST_FITTED = 20, 20_000, 2_000
+_MOST_DRIFT, _STEP_S = 1e-3, 0.1
+"""Two quartz clocks differ by less than this drift; what a busy machine adds to it in all, s."""
+_LOSSES = ("lost", "crc_errors", "short", "repeated", "restarts")
+"""Of :class:`hw.active_echo.device.EchoStatistics` and
+:class:`hw.ultrasound.receiver.UltrasoundStatistics`: attributes of /ae and /us."""
 _BAD_FRAMES = {
     "crc_errors": "arrived damaged (CRC)",
     "lost": "were lost (missed triggers, or damaged on the way)",
@@ -154,13 +159,9 @@ class Session:
             return
         self._stopping = True
         self._thread.join()
-        self._record_clocks()
         with suppress(CalibrationError):
-            repeated = self.echo.statistics().repeated
-            self._recorder.attributes("ae", {"repeated": repeated})
-            if repeated:
-                text = f"{repeated} echo frames came twice; the second ones were dropped"
-                self._recorder.add_event("repeated", text, self.clock.now())
+            self._record_clocks()
+            self._record_losses()
         self._devices.close()
 
     # Trouble
@@ -271,6 +272,10 @@ class Session:
         began = self.clock.now()
         if began - self._delay_measured > DELAY_S:
             self._measure_echo_delay()
+            problem = self._clock_of("active echo")
+            if isinstance(problem, str):
+                text = f"{problem}: times of flight may be wrong"
+                raise DeviceError(text, device="active echo")
         found: list[EchoFrame] = []
         with self._changed:
             while True:
@@ -410,16 +415,49 @@ class Session:
             del stamps[::2]
 
     def _record_clocks(self) -> None:
-        """Fit every device's clock and put the fits into the recording."""
+        """Fit every device's clock and put the fits, or why there is none, into the recording."""
         now = self.clock.now()
-        for device, stamps in self._stamps.items():
-            pairs = np.array([pair for pair in stamps if np.isfinite(pair).all()])
-            # Stamps must increase; a device that sends none, or was restarted, has no fit.
-            if len(pairs) < _LEAST_STAMPS or (np.diff(pairs[:, 0]) <= 0).any():
-                continue
-            fit = fit_clock(pairs[:, 0], pairs[:, 1])
-            with suppress(CalibrationError):
+        for device in self._stamps:
+            fit = self._clock_of(device)
+            if isinstance(fit, ClockFit):
                 self._recorder.add_clock(device, fit, now)
+            elif fit is not None:
+                self._recorder.add_event("clock", f"{device}: {fit}", now)
+
+    def _clock_of(self, device: str) -> ClockFit | str | None:
+        """The fit of a device's clock; what is wrong with its time stamps; or None: too few."""
+        stamps = np.array(self._stamps.get(device, []), float).reshape(-1, 2)
+        pairs = stamps[np.isfinite(stamps).all(axis=1)]
+        if len(pairs) < _LEAST_STAMPS:
+            return None
+        if (np.diff(pairs[:, 0]) <= 0).any():
+            return "its time stamps went back: its clock has no fit"
+        fit = fit_clock(*pairs[:: 1 + len(pairs) // _MOST_FITTED].T)
+        span = float(np.ptp(pairs[:, 1]))
+        if abs(fit.drift) * span > _MOST_DRIFT * span + self.clock.patience(_STEP_S):
+            rate = 1.0 / max(1.0 + fit.drift, 1e-12)
+            return (
+                f"its clock was set, or counts {rate:.4g} s a second by the clock of this "
+                "computer, or its data come later and later"
+            )
+        return fit
+
+    def _record_losses(self) -> None:
+        """Put what did not come into the recording: nothing is filled in, so it does not show."""
+        echo = self.echo.statistics()
+        counts: dict[str, EchoStatistics | UltrasoundStatistics] = {"ae": echo}
+        full = {"tracker": self.poses.dropped, "ae": echo.dropped}
+        if self.images is not None:
+            counts["us"] = self.images.statistics()
+        for group, found in counts.items():
+            losses = {name: getattr(found, name) for name in _LOSSES if hasattr(found, name)}
+            self._recorder.attributes(group, losses)
+            text = ", ".join(f"{count} {name}" for name, count in losses.items() if count)
+            if text:
+                self._recorder.add_event("losses", f"/{group}: {text}", self.clock.now())
+        for group, count in full.items():
+            if count:
+                self._recorder.dropped[group] = self._recorder.dropped.get(group, 0) + count
 
 
 def frame_period(frames: Sequence[EchoFrame], clock_hz: float) -> float | None:

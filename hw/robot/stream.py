@@ -9,6 +9,7 @@ latency that was there from the start counts too.
 
 from __future__ import annotations
 
+import math
 import pickle
 import subprocess
 import threading
@@ -48,7 +49,7 @@ class PoseSample:
     robot_mode: int
     runtime_state: int
     lag_s: float = 0.0
-    """Upper bound of how long it was on its way, bench s (:class:`Lag`)."""
+    """Upper bound of how long it was on its way, bench s; infinite if not known (:class:`Lag`)."""
     joints: tuple[float, ...] | None = None
     """(6,) rad; None where they were not read from the controller."""
 
@@ -78,6 +79,8 @@ class PoseSample:
 
     def age_text(self, now: float) -> str:
         """Its age in words, split into the time since arrival and the latency before."""
+        if math.isinf(self.lag_s):
+            return "of unknown age: the controller's clock was set forward, or runs too fast"
         return (
             f"{1000 * self.age_s(now):.0f} ms old: it came {1000 * (now - self.t_host):.0f} ms ago "
             f"and was on its way for up to {1000 * self.lag_s:.0f} ms"

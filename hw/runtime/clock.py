@@ -12,6 +12,7 @@ import time
 from dataclasses import dataclass, field
 
 _MOST_DRIFT = 200e-6
+_MOST_AHEAD_S = 0.1
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,10 @@ class Lag:
     later replaces it. As clocks drift, the bound is raised by 200 ppm of the time that passes, more
     than quartz clocks differ by; a lag that grows faster than that is still seen.
 
+    A difference below the pair's, by more than this drift and 0.1 s, is impossible: the device's
+    clock was set forward, runs fast, or counts in another unit. Such a clock would hide a lag: from
+    then on the lag is infinite.
+
     Args:
         t_host: of the pair, bench s; without a pair, lags count from the smallest one seen.
         t_device: of the pair, s.
@@ -79,13 +84,18 @@ class Lag:
 
     def __init__(self, t_host: float = math.inf, t_device: float = 0.0) -> None:
         self._floor = t_host - t_device
+        self._lowest = self._floor - _MOST_AHEAD_S if math.isfinite(t_host) else -math.inf
         self._last = t_host
 
     def of(self, t_host: float, t_device: float) -> float:
         """Take the times of a pose or an image; returns its lag."""
         difference = t_host - t_device
         if math.isfinite(self._last):
-            self._floor += _MOST_DRIFT * max(t_host - self._last, 0.0)
+            drift = _MOST_DRIFT * max(t_host - self._last, 0.0)
+            self._floor += drift
+            self._lowest -= drift
         self._last = t_host
         self._floor = min(self._floor, difference)
+        if self._floor < self._lowest:
+            self._floor = -math.inf
         return difference - self._floor

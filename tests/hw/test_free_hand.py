@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import json
 import re
+import socket
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 import h5py
@@ -27,6 +30,8 @@ from hw.robot.rtde import PacketReader
 from hw.runtime.errors import DeviceError
 from hw.ultrasound.receiver import Image, UltrasoundStream
 from jaxcal import FormatError, InputError
+from jaxcal.io.message_content import Picture, Tracked
+from jaxcal.io.openigtlink import Message, encode
 
 SERVER = Path(__file__).with_name("plus_server.py")
 
@@ -418,6 +423,61 @@ def test_an_image_waits_for_the_pose_of_a_negative_lag(separate):
         # The stream's stamps run six times as fast as the clock on the wall.
         images = PosedImages(stream, lag_s=-4.0)
         assert images.read(3.0).pose is not None
+
+
+@contextmanager
+def sending(stamp: Callable[[str, float], float]) -> Iterator[PosedImages]:
+    """Images of a stream of 1.6 s whose poses have x = the time in mm.
+
+    Args:
+        stamp: kind of message and its time (s) -> its time stamp (s).
+    """
+    picture = Picture(np.zeros((4, 4), np.uint8), SPACING_MM)
+
+    def serve() -> None:
+        with listener.accept()[0] as connection, suppress(OSError):
+            began = time.monotonic()
+            for t in np.arange(0.0, 1.6, 0.02):
+                time.sleep(max(0.0, began + t - time.monotonic()))
+                pose = np.eye(4)
+                pose[0, 3] = t
+                moved = Message(
+                    "TRANSFORM", "ProbeToTracker", stamp("TRANSFORM", t),
+                    (Tracked("ProbeToTracker", pose),),
+                )  # fmt: skip
+                shown = Message("IMAGE", "Image", stamp("IMAGE", t + 0.01), picture)
+                connection.sendall(encode(moved) + encode(shown))
+            connection.recv(1)
+
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        thread = threading.Thread(target=serve)
+        thread.start()
+        with UltrasoundStream(*listener.getsockname()) as stream:
+            yield PosedImages(stream)
+        thread.join()
+
+
+def test_no_image_has_the_pose_of_an_earlier_place_after_its_clock_was_set_back():
+    """Where images and poses have clocks of their own, it was taken without a word."""
+
+    def stamp(kind: str, t: float) -> float:
+        return 100.0 + t - (0.5 if kind == "IMAGE" and t > 0.895 else 0.0)
+
+    with sending(stamp) as images:
+        assert not images.by_arrival
+        posed = [images.read(60.0) for _ in range(79)]
+    off = [
+        0.0 if each.pose is None else abs(each.pose[0, 3] - (0.02 * number + 0.01))
+        for number, each in enumerate(posed)
+    ]
+    assert max(off) < 0.005
+    assert all(each.pose is not None for each in posed[:40])
+
+
+def test_time_stamps_in_another_unit_are_not_used():
+    """They let an image be taken of a probe that was held still for a thousandth of the time."""
+    with sending(lambda kind, t: 1000.0 * (100.0 + t)) as images:
+        assert images.by_arrival
 
 
 def still(pose: np.ndarray, t: float, frame: np.ndarray) -> PosedImage:

@@ -94,6 +94,7 @@ def put_in_order(robot: EmulatedRobot) -> None:
     """End every fault, and set at the pendant what the plan says."""
     robot.ask("unmute")
     robot.ask("mute control", False)
+    robot.ask("freeze", False)
     robot.ask("dashboard", None)
     robot.ask("robot_state", 7, 1)
     robot.ask("payload", 0.0)
@@ -201,6 +202,21 @@ def test_a_robot_that_is_faster_than_commanded_is_stopped(robots):
         assert motion.ended
     robot.ask("overspeed", 1.0)
     assert abs(1000.0 * robot.state()["raw"][0] - target[0, 3]) > 1.0
+
+
+def test_poses_that_are_frozen_with_new_stamps_end_motion(robots):
+    """Box and arrival are checked by the poses: the arm would move unseen up to its target."""
+    robot = robots["CB"]
+    put_in_order(robot)
+    with moving(robot, caller_s=2.0) as motion:
+        target = farther(robot)
+        robot.ask("freeze", True)
+        with pytest.raises(StoppedError, match=r"pose is frozen, [1-9].* mm from the target"):
+            motion.move_to(target)
+        assert motion.ended
+        assert robot.state()["rest_since"] is not None
+        assert abs(1000.0 * robot.state()["raw"][0] - target[0, 3]) > 1.0
+    put_in_order(robot)
 
 
 def test_lost_answers_end_motion_though_poses_come(robots):

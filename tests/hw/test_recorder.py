@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import suppress
 from types import SimpleNamespace
 
 import h5py
@@ -318,6 +319,34 @@ def test_a_disk_that_does_not_answer_or_is_full_is_one_line(tmp_path):
     with pytest.raises(jaxcal.OutputError, match="nearly full"):
         writer.flush()
     RecordingWriter.resume(tmp_path / "nearly.h5").close()
+
+
+def test_a_writer_that_takes_no_data_does_not_hold_the_end_up(tmp_path, monkeypatch):
+    """As where a disk hangs: closing waited without end, deaf to Ctrl-C, and said nothing."""
+    path, recording = tmp_path / "rec.h5", simulated()
+    recorder = Recorder(path, HEADER, queue_bytes=2**20)
+    take(recorder, recording, 0)
+    recorder._patience = 0.2
+    monkeypatch.setattr("hw.recording.recorder._ENDING_S", 0.2)
+    os.kill(recorder._process.pid, signal.SIGSTOP)
+    for k in range(400):
+        recorder.add_images(frames(k, 1))
+    assert recorder.dropped["us"]
+
+    def close() -> None:
+        with suppress(jaxcal.OutputError):
+            recorder.close()
+
+    closing = threading.Thread(target=close)
+    closing.start()
+    closing.join(20.0)
+    held_up = closing.is_alive()
+    recorder._process.kill()
+    assert not held_up
+    assert "did not end" in str(recorder.error)
+    monkeypatch.undo()
+    with Recorder(path) as again:
+        assert again.rows["calibration"] == 1
 
 
 def test_files_that_are_not_resumed(tmp_path):

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 import socket
 import threading
 import time
 from contextlib import suppress
+from dataclasses import replace
 
 import h5py
 import numpy as np
@@ -24,11 +26,12 @@ from hw.bench.world import make_world
 from hw.planning.scene import Scene
 from hw.recording.layout import RecordingHeader
 from hw.recording.recorder import Recorder
-from hw.recording.session import Session, frame_period
+from hw.recording.session import DELAY_S, Session, Watch, frame_period
 from hw.runtime.clock import Clock
-from hw.runtime.errors import RefusedError, StaleError
+from hw.runtime.errors import DeviceError, RefusedError, StaleError
 from hw.setup.description import Setup
 from jaxcal.data.probe import LinearProbe
+from jaxcal.io.openigtlink import Message
 
 pytest.importorskip("serial", reason="needs jaxcal[serial]")
 
@@ -135,12 +138,59 @@ def test_a_frame_of_before_the_probe_came_to_rest_is_not_measured(tmp_path, mome
                 session.image_after(robot.clock.now())
                 stage = ProbeStage(session, motion, PLAN.targets, lambda kind, text: None)
                 stage.go_to(2)
+                bench = stage.image_bench(2)
                 if moment == "never":
+                    assert bench.read(1).heard
                     place, _ = stage.locate(2)
                     np.testing.assert_allclose(place, [3.0, 45.0], atol=0.3)
                     return
-                with pytest.raises(StaleError, match="before the probe came to rest"):
-                    stage.locate(2)
+                for look in (stage.locate, bench.read):
+                    with pytest.raises(StaleError, match="before the probe came to rest"):
+                        look(2)
+
+
+class Odd(ImageServer):
+    """Its stamps are in ms, and one image in four is lost."""
+
+    def _message(self, *args) -> Message:
+        message = super()._message(*args)
+        return replace(message, t_device=1000.0 * message.t_device)
+
+    def _broadcast(self, batch: list[bytes]) -> None:
+        if self.sent % 4:
+            super()._broadcast(batch)
+
+
+def test_clocks_that_are_wrong_and_images_that_are_lost_are_recorded(tmp_path):
+    """Ticks of another frequency than the device states are wrong times of flight."""
+    path = tmp_path / "r.h5"
+    scene = Scene(np.eye(4), np.array([400.0, -100.0, 0.0]), np.array([0.0, 0.0, -1.0]))
+    with (
+        EmulatedRobot(version=CB_SERIES, speed=20.0) as robot,
+        AuspisEmulator(silence, clock=robot.clock, lines=8) as emulator,
+        Odd(lambda t: np.zeros((40, 30), np.uint8), clock=robot.clock, rate_hz=5.0) as machine,
+        Recorder(path, RecordingHeader("pixel", {}, 8, settings="{}")) as recorder,
+    ):
+        emulator.fault(clock=1.5)
+        setup = Setup(
+            robot.host, emulator.path, scene, {}, (machine.host, machine.port),
+            probe=LinearProbe(elements=8), clock=robot.clock,
+        )  # fmt: skip
+        with Session(setup, recorder, watch=Watch(image_age_s=10.0)) as session:
+            robot.clock.sleep(DELAY_S + 2.0)
+            while min(map(len, session._stamps.values())) < 25:
+                time.sleep(0.01)
+            with pytest.raises(
+                DeviceError, match=r"counts 1\.\d+ s a second .*flight may be wrong"
+            ):
+                session.listen(1, robot.clock.now())
+    with h5py.File(path) as file:
+        assert set(file["clock/device"][()]) <= {b"robot"}
+        assert file["us"].attrs["lost"] >= 5
+        told = dict(zip(file["events/text"], file["events/kind"], strict=True))
+    assert b"losses" in told.values()
+    assert any(re.match(rb"active echo: its clock was set, or counts ", text) for text in told)
+    assert any(re.match(rb"ultrasound: its clock was set, or counts ", text) for text in told)
 
 
 def test_images_of_a_machine_that_also_sends_rf(tmp_path):

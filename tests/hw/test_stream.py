@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import queue
 import socket
 import struct
@@ -196,6 +197,34 @@ def test_a_lag_that_was_there_from_the_start_or_creeps_is_seen():
     assert seen[-1] > 0.13
     # Without a first pair only what is more than the least can be seen.
     assert Lag().of(10.3, 10.0 + offset) == 0.0
+
+
+def look_on(poses: PoseStream) -> None:
+    deadline = time.monotonic() + 20.0
+    while time.monotonic() < deadline:
+        poses.latest()
+        time.sleep(0.01)
+
+
+def test_time_stamps_that_step_or_run_fast_make_no_pose_fresh():
+    """A clock that gains on the host's hides any lag, so that a late pose passed as new."""
+    late, unknown = "on its way for up to", "of unknown age: the controller's clock"
+    ahead = Lag(10.0, 1000.0)
+    assert [ahead.of(t, 990.0 + t * (1 + 150e-6)) for t in (10.0, 1000.0)] == [0.0, 0.0]
+    assert ahead.of(1000.1, 2000.0) == ahead.of(1001.0, 1991.0) == math.inf
+    with EmulatedRobot(version=CB_SERIES) as robot:
+        for stamps, text in (
+            ((1005.0, 1.0), unknown),
+            ((1000.0, 1000.0), unknown),
+            ((995.0, 1.0), late),
+            ((0.0, 1.0), late),
+        ):
+            robot.ask("stamps", 1000.0, 1.0)
+            with PoseStream(robot.host, clock=robot.clock, max_age_s=3.0) as poses:
+                poses.latest()
+                robot.ask("stamps", *stamps)
+                with pytest.raises(StaleError, match=text):
+                    look_on(poses)
 
 
 @contextmanager

@@ -41,6 +41,9 @@ _STEADY_S, _STEADY_POLL_S = 0.5, 0.05
 _ARRIVED_MM, _ARRIVED_DEG = 0.2, 0.1
 _REST_MM_S = 0.2
 _LEAST_PATIENCE_S = 3.0
+_FROZEN_S, _FROZEN_MM = 0.3, 0.1
+"""A robot on its way to a target reports another pose within this time and the time for this way:
+it begins to move within milliseconds, and its encoders tell smaller steps (assumptions)."""
 
 
 class _Interrupted(Exception):
@@ -76,6 +79,9 @@ class ControlLoop:
         """Number of the newest request to move that was taken."""
         self._moving: Command | None = None
         self._deadline = self._steady_due = 0.0
+        self._last_raw: tuple[float, ...] = ()
+        self._changed = 0.0
+        """When the pose changed last."""
         self._reported = -math.inf
         self._virtual: PoseSample | None = None
         """In a dry run, where the robot would stand."""
@@ -161,7 +167,7 @@ class ControlLoop:
         command = self._allow(pose, speed_mm_s)
         controller.move(list(command.raw), command.speed_m_s, command.acceleration_m_s2)
         now = self._clock.now()
-        self._steady_due = now + _STEADY_S
+        self._steady_due, self._changed = now + _STEADY_S, now
         self._deadline = now + 1.5 * command.duration_s + self._clock.patience(_LEAST_PATIENCE_S)
         self._moving = command
         # A stop that came while moveL was being sent acts at once, not a tick later.
@@ -190,9 +196,13 @@ class ControlLoop:
         self._arrive(self._virtual)
 
     def _follow(self, command: Command) -> None:
-        """Answer when the motion has arrived and rests; latch a stop for good when it is late."""
+        """Answer when the motion has arrived and rests.
+
+        Latches a stop for good when it is late, or when the poses do not show any motion: boxes
+        cannot be checked then.
+        """
         now = self._clock.now()
-        pose = self._inputs.sample.pose
+        pose, raw = self._inputs.sample.pose, self._inputs.sample.raw
         off = float(np.linalg.norm(pose[:3, 3] - command.pose[:3, 3]))
         there = off < _ARRIVED_MM and turn_deg(pose, command.pose) < _ARRIVED_DEG
         if not (there and self._inputs.packet.speed_mm_s < _REST_MM_S):
@@ -208,8 +218,15 @@ class ControlLoop:
                 if self._latch.stop is None:
                     self._arrive(self._inputs.sample)
                 return
-        if now > self._deadline:
+        if there or raw != self._last_raw:
+            self._last_raw, self._changed = raw, now
+        text = ""
+        slow = command.speed_mm_s * self._gate.plan.pendant.speed_fraction
+        if now - self._changed > self._clock.patience(_FROZEN_S) + _FROZEN_MM / slow:
+            text = f"the reported pose is frozen, {off:.2f} mm from the target of a motion"
+        elif now > self._deadline:
             text = f"not arrived in time: {off:.2f} mm from the target"
+        if text:
             self._latch.set(Stop(StoppedError(text, device="robot"), True))
 
     def _arrive(self, sample: PoseSample) -> None:
