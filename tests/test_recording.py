@@ -129,3 +129,13 @@ def test_frames_have_names(tmp_path, name):
     with pytest.raises(InputError, match=r"rec\.h5: pose_frames must be the names") as caught:
         jaxcal.load(path)
     assert str(caught.value).isprintable()
+
+
+def test_images_that_are_not_in_the_order_of_time_are_told():
+    images = jaxcal.simulate_recording(jaxcal.Protocol(images=12), 3).calibration
+    order = np.random.default_rng(1).permutation(12)
+    # Recordings that were resumed or joined begin again.
+    for time, told in ((order, True), (np.arange(12) % 4, False), (None, False)):
+        timed = dataclasses.replace(images, time=None if time is None else np.array(time, float))
+        said = "\n".join(jaxcal.calibrate(timed, "conventional").warnings)
+        assert ("not in the order of their time stamps" in said) == told

@@ -178,7 +178,11 @@ def calibrate(
     if isinstance(problem, Recording):
         found = replace(found, probe=problem.probe, pose_frames=problem.pose_frames)
         problem = problem.calibration
-    return replace(found, frame_size=problem.frame_size) if isinstance(problem, Images) else found
+    if not isinstance(problem, Images):
+        return found
+    order = problem.out_of_order()
+    notes = found.notes if order is None else (*found.notes, order)
+    return replace(found, frame_size=problem.frame_size, notes=notes)
 
 
 @in_own_modes

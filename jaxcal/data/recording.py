@@ -40,6 +40,9 @@ Kind = Literal["point", "pixel", "time_of_flight"]
 _EXTENT_MM = 50.0
 """Of a target's path through the image where nothing better is known."""
 _AT_REST_MM = 1e-6
+_MOST_BACK = 0.25
+"""Largest share of steps back in time of images in order. A random order has half."""
+
 OF_SOME = {
     "covariance": "covariances of the points",
     "max_elevation": "bounds on the offsets",
@@ -94,6 +97,22 @@ class Images:
 
     def __len__(self) -> int:
         return len(self.poses)
+
+    def out_of_order(self) -> str | None:
+        """In words, that many used images are older than the one before; None where few are.
+
+        A few are where recordings were resumed or joined.
+        """
+        if self.time is None:
+            return None
+        steps = np.diff(self.time[self.mask])
+        back = int(np.count_nonzero(steps < 0))
+        if back <= _MOST_BACK * len(steps):
+            return None
+        return (
+            f"the images are not in the order of their time stamps ({back} of {len(steps)} steps "
+            "go back): errors that are alike in successive images are not found; sort them by time"
+        )
 
     def __repr__(self) -> str:
         """Number and kind of the images, and what is known of each; not the arrays."""
