@@ -7,7 +7,7 @@ the problem and two p x p matrices:
 - S, the *information* of the shared unknowns: the normal matrix of the whitened residuals with the
   offsets eliminated. Its inverse, times the residuals' variance where they are in mm, is the
   covariance (the Cramer-Rao bound, where no offset rests on its bound). The conventional method's
-  has a variance for each axis (:func:`jaxcal.diagnostics.uncertainty.information_by_axis`).
+  has a variance for each axis (:func:`jaxcal.diagnostics.uncertainty.covariance_by_axis`).
 - D, the *design*: the normal matrix of the unweighted residuals with the offsets known.
 
 The status needs no spectrum. Rotations, scales and sound speed are multiplied by the lever arm L,
@@ -29,7 +29,7 @@ from jaxcal.data.recording import MINIMUM_IMAGES
 from jaxcal.diagnostics.uncertainty import (
     AT_BOUND,
     LARGEST_SD,
-    information_by_axis,
+    covariance_by_axis,
     mm_at_target,
     threshold,
 )
@@ -47,7 +47,12 @@ from jaxcal.result.calibration import Calibration, Linearisation, Medium, Status
 from jaxcal.solvers.convergence import Convergence
 from jaxcal.solvers.dense import inverse_batch_last
 from jaxcal.solvers.methods import Solution
-from jaxcal.solvers.normal_equations import accumulate, component_sums, stacked
+from jaxcal.solvers.normal_equations import (
+    ComponentSums,
+    accumulate,
+    component_sums,
+    stacked,
+)
 from jaxcal.solvers.plan import Given, SolvePlan
 
 LEAST_GAP_MM = 1e-6
@@ -73,7 +78,7 @@ def assemble(
     """
     problem = problem.cleared(problem.mask)
     observation = found.observation
-    information, design = barrier(_normal_matrices(found, images))
+    information, design, axes = barrier(_normal_matrices(found, images))
     # Without this barrier the compiler would repeat the end of the solve for every image.
     iterate, local, sigma, bound, convergence = barrier(
         (
@@ -102,7 +107,7 @@ def assemble(
         variance = in_plane / jnp.maximum(3 * used - count_unknowns(blocks), 1.0)
 
     lever = jax.lax.stop_gradient(errors.lever())
-    covariance, observed = covariance_and_observability(
+    inverse, observed = inverse_and_observability(
         information,
         design,
         variance,
@@ -110,7 +115,12 @@ def assemble(
         LARGEST_SD * lever,
         bounded=plan.prior == "bounded",
     )
-    covariance, averaged = jnp.moveaxis(covariance, -1, 0), found.averaged
+    if axes is not None:
+        parts = jax.vmap(stacked)(axes.matrix)
+        inverse = covariance_by_axis(parts, axes.squares, used, inverse, lever)
+        observable = jnp.logical_not(observed.degenerate | observed.weak)
+        information = jnp.where(observable, inverse_batch_last(inverse)[0], information)
+    covariance, averaged = jnp.moveaxis(variance * inverse, -1, 0), found.averaged
     if averaged is not None:
         # What the Gaussian solution cannot determine at all stays unknown.
         better = averaged.law.weighed[..., None, None] & jnp.isfinite(covariance)
@@ -170,31 +180,22 @@ def assemble(
 
 def _normal_matrices(
     found: Solution, images: ImagePlanes
-) -> tuple[Float[Array, "p p batch"], Float[Array, "p p batch"]]:
-    """S and D at a solution."""
+) -> tuple[Float[Array, "p p batch"], Float[Array, "p p batch"], ComponentSums | None]:
+    """S and D at a solution, and the parts of the axes of a fit with equal weights to all three."""
     observation, iterate = found.observation, found.iterate
     geometry = observation.geometry(images, iterate.blocks)
     if isinstance(observation, InPlane):
         sums = component_sums(iterate, observation.by_axis(), images, None)
-        parts = jax.vmap(stacked)(sums.matrix)
-        design = jnp.sum(parts, axis=0)
-        lever = Errors.of(iterate, images).lever()
-        information = information_by_axis(parts, sums.squares, images.used, lever, _ridged_inverse)
-        # Where the poses determine nothing, the design alone tells.
-        return jnp.where(jnp.isfinite(information), information, design), design
+        design = stacked(jnp.sum(sums.matrix, axis=0))
+        return design, design, sums
     if geometry is observation and observation.whitened:
         sums = component_sums(iterate, observation, images, None, found.medium)
-        return sums.weighted(1 / observation.sigma**2).stacked(), stacked(jnp.sum(sums.matrix, 0))
+        weighted = sums.weighted(1 / observation.sigma**2).stacked()
+        return weighted, stacked(jnp.sum(sums.matrix, 0)), None
     weighted = accumulate(iterate, observation, images, None, found.medium).stacked()
     if geometry is observation:
-        return weighted, weighted
-    return weighted, accumulate(iterate, geometry, images, None).stacked()
-
-
-def _ridged_inverse(matrix: Float[Array, "p p batch"]) -> Float[Array, "p p batch"]:
-    """Inverses of symmetric matrices with a ridge at the level of rounding."""
-    eye = jnp.eye(len(matrix), dtype=matrix.dtype)[..., None]
-    return inverse_batch_last(matrix * (1 + 16 * jnp.finfo(matrix.dtype).eps * eye))[0]
+        return weighted, weighted, None
+    return weighted, accumulate(iterate, geometry, images, None).stacked(), None
 
 
 class Errors(eqx.Module):
@@ -286,7 +287,7 @@ class Observability(eqx.Module):
     singular: Bool[Array, " batch"]
 
 
-def covariance_and_observability(
+def inverse_and_observability(
     information: Float[Array, "p p batch"],
     design: Float[Array, "p p batch"],
     variance: Float[Array, " batch"],
@@ -295,7 +296,7 @@ def covariance_and_observability(
     *,
     bounded: bool = False,
 ) -> tuple[Float[Array, "p p batch"], Observability]:
-    """Covariance (NaN where there is none) and observability, by one elimination; batch axis last.
+    """S^-1 (NaN where there is none) and observability, by one elimination; batch axis last.
 
     Args:
         information: of the unknowns, offsets eliminated.
@@ -335,7 +336,7 @@ def covariance_and_observability(
     found = Observability(
         degenerate=degenerate, weak=below & (not bounded), singular=degenerate | (below & bounded)
     )
-    return jnp.where(found.singular, jnp.nan, variance * inverse), found
+    return jnp.where(found.singular, jnp.nan, inverse), found
 
 
 def _status(

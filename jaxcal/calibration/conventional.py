@@ -20,7 +20,7 @@ from jaxcal.data.problem import Problem
 from jaxcal.diagnostics.image_errors import ImageErrors
 from jaxcal.diagnostics.uncertainty import (
     LARGEST_SD,
-    information_by_axis,
+    covariance_by_axis,
     inverses,
     mm_at_target,
     rounding,
@@ -78,20 +78,15 @@ def _with_uncertainty(found: ClosedForm, problem: Problem, plan: SolvePlan) -> C
     values = np.linalg.eigvalsh(design / scale)
     if values[0] <= threshold(eps) * values.sum():
         return None
-    information = information_by_axis(
-        np.einsum("mkp,mkq->kpq", each, each),
-        np.sum(residual[0] ** 2, axis=0),
-        used,
-        np.asarray(lever[0]),
-        lambda matrix: inverses(matrix[None], eps)[0],
-    )
-    values = np.linalg.eigvalsh(information / scale)
     least = variance / (LARGEST_SD * lever[0]) ** 2
     weak = values[0] <= least and eps * values.sum() < least
     status = Status.UNOBSERVABLE if weak else Status.CONVERGED
-    covariance = variance * inverses(information[None], eps)[0]
-    if weak:
-        covariance = np.full_like(covariance, np.nan)
+    covariance, information = np.full_like(design, np.nan), design
+    if not weak:
+        parts, squares = np.einsum("mkp,mkq->kpq", each, each), np.sum(residual[0] ** 2, axis=0)
+        inverse = inverses(design[None], eps)[0]
+        relative = covariance_by_axis(parts, squares, used, inverse, np.asarray(lever[0]))
+        covariance, information = variance * relative, inverses(relative[None], eps)[0]
 
     parts = [seen.unknowns.further[name] for name in FURTHER if name in blocks]
     further = np.array([part[0] for block in parts for part in block])

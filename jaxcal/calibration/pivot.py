@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxcal import InputError
-from jaxcal.calibration.answer import covariance_and_observability
+from jaxcal.calibration.answer import inverse_and_observability
 from jaxcal.data.poses import check_poses
 from jaxcal.data.problem import Problem
 from jaxcal.data.recording import LEAST_REACH_MM, MINIMUM_IMAGES, MetresError
@@ -311,20 +311,20 @@ def _solve(poses: Float[Array, "n 4 4"], mask: Float[Array, " n"], *, robust: bo
     length = jnp.sqrt(jnp.sum(parameters.translation**2))
     finite = jnp.all(jnp.isfinite(parameters.translation))
     failed = jnp.logical_not(finite) | (jnp.sum(mask) < MINIMUM_IMAGES)
-    covariance, observed = covariance_and_observability(
+    inverse, observed = inverse_and_observability(
         information[..., None],
         information[..., None],
         variance[None],
         jnp.ones((6, 1), poses.dtype),
         LARGEST_SD * jnp.maximum(length, _spread(problem))[None],
     )
-    covariance, observed = jax.tree.map(lambda leaf: leaf[..., 0], (covariance, observed))
+    inverse, observed = jax.tree.map(lambda leaf: leaf[..., 0], (inverse, observed))
     unknown = observed.degenerate | observed.weak
     status = jnp.where(unknown, Status.UNOBSERVABLE, Status.CONVERGED)
     return Pivot(
         tip=parameters.translation,
         point=parameters.point,
-        covariance=jnp.where(unknown, jnp.nan, covariance),
+        covariance=jnp.where(unknown, jnp.nan, variance * inverse),
         sigma=jnp.sqrt(variance),
         rms=jnp.sqrt(jnp.sum(residual**2) / used),
         residual=residual,

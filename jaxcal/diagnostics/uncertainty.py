@@ -16,14 +16,13 @@ unknowns and b by the offset unknown has the variance
 The conventional fit weighs lateral, elevational and axial errors equally, but offsets are usually
 larger than the errors of the points. With S = sum S_k, the sum of the axes' normal matrices, and
 variances v_k of the axes' errors, its unknowns have the covariance S^-1 (sum v_k S_k) S^-1
-(:func:`information_by_axis`).
+(:func:`covariance_by_axis`).
 
 Reference: White 1980 (covariance of a fit whose weights are not those of its errors).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -195,34 +194,33 @@ def variances_by_axis(
     return xp.where(exact, 1.0, found)
 
 
-def information_by_axis(
+def covariance_by_axis(
     parts: Float[AnyArray, "k p p *batch"],
     squares: Float[AnyArray, " k *batch"],
     used: Float[AnyArray, "*batch"],
+    inverse: Float[AnyArray, "p p *batch"],
     lever: Float[AnyArray, "*batch"],
-    invert: Callable[[Any], Any],
 ) -> Any:
-    """Information of a fit with equal weights, if errors have a variance for each axis.
+    """Covariance of a fit with equal weights, if errors have a variance for each axis.
 
     Args:
         parts: S_k, the axes' normal matrices.
         squares: sums of the axes' squared residuals, mm^2.
         used: number of images.
+        inverse: of S = sum S_k.
         lever: lever arm, mm.
-        invert: inverts symmetric matrices (p, p, *batch).
 
     Returns:
-        S (sum v_k S_k)^-1 S, (p, p, *batch), with the variances v_k in units of the pooled one. It
-        is S if they are equal.
+        S^-1 (sum v_k S_k) S^-1, (p, p, *batch), with the variances v_k in units of the pooled one.
     """
-    whole = parts.sum(axis=0)
-    variances = variances_by_axis(parts, squares, used, invert(whole), lever)
+    variances = variances_by_axis(parts, squares, used, inverse, lever)
     middle = (variances[:, None, None] * parts).sum(axis=0)
 
     def product(left: Any, right: Any) -> Any:
         return (left[:, :, None] * right[None]).sum(axis=1)
 
-    return product(product(whole, invert(middle)), whole)
+    found = product(product(inverse, middle), inverse)
+    return 0.5 * (found + found.swapaxes(0, 1))
 
 
 def threshold(eps: float) -> float:
