@@ -195,7 +195,9 @@ def test_leaving_an_image_out_is_foretold(result):
     problem = replace(result.problem, mask=(np.arange(result.problem.images) < 19).astype(float))
     result = jaxcal.calibrate(problem, "conventional", estimate=("scale",))
     found = influence_of(result)
-    sd = np.sqrt(np.diagonal(result.unknowns_covariance))
+    # SDs of errors that are alike along all axes.
+    lines = result.linearisation
+    sd = np.sqrt(lines.variance * np.diagonal(np.linalg.inv(lines.design)))
     for image in (2, 11):
         mask = np.array(problem.mask)
         mask[image] = 0.0
@@ -203,13 +205,9 @@ def test_leaving_an_image_out_is_foretold(result):
         twist = relative_twist(
             jnp.asarray(result.image_to_probe), jnp.asarray(without.image_to_probe)
         )
-        np.testing.assert_allclose(
-            found.moved[image, :6] / sd[:6], twist / sd[:6], rtol=0.02, atol=0.02
-        )
+        np.testing.assert_allclose(found.moved[image, :6] / sd[:6], twist / sd[:6], atol=0.03)
         grown = np.log(np.asarray(without.scale_mm_per_px) / np.asarray(result.scale_mm_per_px))
-        np.testing.assert_allclose(
-            found.moved[image, 9:] / sd[9:], grown / sd[9:], rtol=0.02, atol=0.02
-        )
+        np.testing.assert_allclose(found.moved[image, 9:] / sd[9:], grown / sd[9:], atol=0.03)
     np.testing.assert_allclose(found.model_covariance, result.unknowns_covariance, rtol=1e-6)
     np.testing.assert_allclose(found.shares.sum(axis=0), found.model_covariance, rtol=1e-6)
 

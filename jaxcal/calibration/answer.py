@@ -32,6 +32,7 @@ from jaxcal.diagnostics.uncertainty import (
     covariance_by_axis,
     mm_at_target,
     threshold,
+    variances_by_axis,
 )
 from jaxcal.model.batch import ImagePlanes, Iterate, barrier, targets
 from jaxcal.model.observations import (
@@ -117,7 +118,8 @@ def assemble(
     )
     if axes is not None:
         parts = jax.vmap(stacked)(axes.matrix)
-        inverse = covariance_by_axis(parts, axes.squares, used, inverse, lever)
+        variances = variances_by_axis(parts, axes.squares, used, inverse, lever)
+        inverse = covariance_by_axis(parts, variances, inverse)
         observable = jnp.logical_not(observed.degenerate | observed.weak)
         information = jnp.where(observable, inverse_batch_last(inverse)[0], information)
     covariance, averaged = jnp.moveaxis(variance * inverse, -1, 0), found.averaged

@@ -25,6 +25,7 @@ from jaxcal.diagnostics.uncertainty import (
     mm_at_target,
     rounding,
     threshold,
+    variances_by_axis,
 )
 from jaxcal.model.unknowns import FURTHER, count_unknowns, split_further
 from jaxcal.result.calibration import Calibration, Linearisation, Medium, Status
@@ -85,7 +86,8 @@ def _with_uncertainty(found: ClosedForm, problem: Problem, plan: SolvePlan) -> C
     if not weak:
         parts, squares = np.einsum("mkp,mkq->kpq", each, each), np.sum(residual[0] ** 2, axis=0)
         inverse = inverses(design[None], eps)[0]
-        relative = covariance_by_axis(parts, squares, used, inverse, np.asarray(lever[0]))
+        variances = variances_by_axis(parts, squares, used, inverse, np.asarray(lever[0]))
+        relative = covariance_by_axis(parts, variances, inverse)
         covariance, information = variance * relative, inverses(relative[None], eps)[0]
 
     parts = [seen.unknowns.further[name] for name in FURTHER if name in blocks]

@@ -167,8 +167,7 @@ def _influence(
 
     steps = rows @ inverse
     leverage = steps @ np.swapaxes(rows, 1, 2)
-    left = np.eye(components) - 0.5 * (leverage + leverage.mT)
-    values, vectors = np.linalg.eigh(left)
+    values, vectors = np.linalg.eigh(np.eye(components) - 0.5 * (leverage + leverage.mT))
     # Without an image that alone determines a direction there is no answer to move to.
     alone = (values <= _LEAST_LEFT).any(axis=1)
     values = np.maximum(values, _LEAST_LEFT)
@@ -180,10 +179,9 @@ def _influence(
     # The covariance of the errors that are left.
     spreads, axes = values, vectors
     if covariance is not inverse:
-        other = (np.eye(components) - leverage) * found.variances - found.variances[:, None] * (
-            leverage.mT
-        )
-        spreads, axes = np.linalg.eigh(other + rows @ covariance @ np.swapaxes(rows, 1, 2))
+        own_sizes = np.diag(found.variances)
+        crossed = leverage @ own_sizes + own_sizes @ leverage.mT
+        spreads, axes = np.linalg.eigh(own_sizes - crossed + rows @ covariance @ rows.mT)
         spreads = np.maximum(spreads, _LEAST_LEFT)
     across = np.sqrt(spreads)[..., None] * (axes.mT @ (vectors / np.sqrt(values)[:, None]))
     expected = across @ halfway

@@ -196,24 +196,16 @@ def variances_by_axis(
 
 def covariance_by_axis(
     parts: Float[AnyArray, "k p p *batch"],
-    squares: Float[AnyArray, " k *batch"],
-    used: Float[AnyArray, "*batch"],
+    variances: Float[AnyArray, " k *batch"],
     inverse: Float[AnyArray, "p p *batch"],
-    lever: Float[AnyArray, "*batch"],
 ) -> Any:
-    """Covariance of a fit with equal weights, if errors have a variance for each axis.
+    """S^-1 (sum v_k S_k) S^-1, (p, p, *batch): in units of the pooled variance, as v_k are.
 
     Args:
-        parts: S_k, the axes' normal matrices.
-        squares: sums of the axes' squared residuals, mm^2.
-        used: number of images.
-        inverse: of S = sum S_k.
-        lever: lever arm, mm.
-
-    Returns:
-        S^-1 (sum v_k S_k) S^-1, (p, p, *batch), with the variances v_k in units of the pooled one.
+        parts: S_k.
+        variances: v_k, from :func:`variances_by_axis`.
+        inverse: S^-1.
     """
-    variances = variances_by_axis(parts, squares, used, inverse, lever)
     middle = (variances[:, None, None] * parts).sum(axis=0)
 
     def product(left: Any, right: Any) -> Any:
