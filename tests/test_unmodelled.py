@@ -14,6 +14,8 @@ from jaxcal.data.poses import targets_in_images
 from jaxcal.data.recording import Recording, make_images
 from jaxcal.diagnostics.misfits import misfits
 from jaxcal.diagnostics.unmodelled import unmodelled
+from jaxcal.model.image_points import distance
+from jaxcal.report.accuracy import region_of
 from jaxcal.report.record import calibration_record
 
 IMAGES = 40
@@ -195,6 +197,30 @@ def test_offsets_free_within_a_bound_do_not_absorb_a_step(answers, asked):
     assert found[0].kind == "step"
     assert abs(found[0].image - 31) <= 2
     assert clear == []
+
+
+@pytest.mark.parametrize(("bound", "least", "most"), [(1.0, 0, 3), (2.0, 6, 8)])
+def test_a_bound_that_moves_the_answer_is_told_of(bound, least, most):
+    """The offsets go to 1 mm. Without the bound the answer is that of Gaussian offsets."""
+    told = 0
+    for recording in map(clean, range(100, 108)):
+        result = jaxcal.calibrate(recording, prior="bounded", max_elevation=bound)
+        record = calibration_record(result, recording)
+        tre = record["tre"]
+        if tre is None:
+            assert bound > 1.0
+            assert record["verdict"] == "uncertain"
+            told += 1
+            continue
+        grid = region_of(result.numpy(), recording).grid()[:, [0, 2]]
+        without = jaxcal.calibrate(recording, prior="gaussian").image_to_probe
+        mine, none = (np.asarray(x) for x in (result.image_to_probe, without))
+        apart = distance(mine, none, np.ones(2), grid, 0.0)
+        assert tre["bound"]["moved_mm"] == pytest.approx(apart, rel=0.1)
+        if any("without the bound" in words for words in tre["contradictions"]):
+            told += 1
+            assert tre["rms_mm"] > 0.999 * np.hypot(tre["stated_mm"], tre["bound"]["moved_mm"])
+    assert least <= told <= most
 
 
 def test_a_second_echo_in_forty_per_cent_of_the_images_is_told_of(answers):

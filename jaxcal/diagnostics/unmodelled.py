@@ -37,6 +37,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from jaxcal.diagnostics import tracker_distortion
+from jaxcal.diagnostics.gaussian_offsets import GaussianOffsets, tuned
 from jaxcal.diagnostics.image_errors import ImageErrors, Whitened
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Bool, Float
@@ -66,10 +67,6 @@ _MOST_STEPS = 16
 """Most places at which a step is tried, evenly spread."""
 _BESIDE_STEP = 3
 """Least number of images before and after a step."""
-_ROUNDS = 8
-"""Rounds of tuning the SDs with the further parameters."""
-_STEPS_TO_GAUSSIAN = 4
-"""Gauss-Newton steps from an answer within bounds to that of Gaussian offsets."""
 SIDE_MM = 20.0
 """The lateral position at which a curve is stated."""
 _WITHIN = (0, 2, 4)
@@ -139,7 +136,8 @@ def unmodelled(calibration: Calibration) -> list[Unmodelled]:
     answer = map_arrays(lambda leaf: np.asarray(leaf)[None], calibration.numpy())
     seen = ImageErrors.of_answer(answer).centred(answer)
     if calibration.prior not in TUNED:
-        seen = _at_gaussian_optimum(seen, used)
+        # Offsets that are free within a bound absorb much of an error, above all a step.
+        seen = GaussianOffsets.of(seen, used).seen
     columns = _columns(seen, used)
     rows = np.concatenate([seen.rows[0], *(each for _, _, each in columns)], axis=-1)[None]
     found: list[Unmodelled] = []
@@ -150,7 +148,7 @@ def unmodelled(calibration: Calibration) -> list[Unmodelled]:
         # The triangle of each kind's rows and errors has the same sums of squares as all images.
         triangle = np.asarray(np.linalg.qr(np.swapaxes(both, 0, 1), mode="r"))
         rows, errors = np.swapaxes(triangle[..., :-1], 0, 1), triangle[..., -1].T
-        before, _ = _tuned(errors, rows[..., :unknowns], int(used.sum()))
+        before, _ = tuned(errors, rows[..., :unknowns], int(used.sum()))
         parts = []
         for kind, image, _ in columns:
             parts.append((kind, image, rows[..., np.r_[:unknowns, at : at + _FREEDOM[kind]]]))
@@ -169,18 +167,6 @@ def unmodelled(calibration: Calibration) -> list[Unmodelled]:
 def _whitened(answer: Calibration, seen: ImageErrors) -> Whitened | ImageErrors:
     """Errors and rows in SDs; in mm for answers without SDs, which are tuned again anyway."""
     return Whitened.of(answer, seen) if answer.prior in TUNED else seen
-
-
-def _at_gaussian_optimum(seen: ImageErrors, used: Bool[Array, " n"]) -> ImageErrors:
-    """The errors at the optimum of Gaussian offsets with tuned SDs, from an answer within bounds.
-
-    Offsets that are free within a bound absorb much of what the model leaves out, above all a step.
-    """
-    for _ in range(_STEPS_TO_GAUSSIAN):
-        _, step = _tuned(seen.errors[0][used], seen.rows[0][used], int(used.sum()))
-        unknowns = seen.unknowns.moved(step[None], seen.blocks)
-        seen = ImageErrors.of(unknowns, seen.problem, seen.blocks)
-    return seen
 
 
 def _columns(
@@ -238,7 +224,7 @@ def _fit(
     ``before`` are the mean squared errors of each kind without them.
     """
     unknowns = rows.shape[-1] - _FREEDOM[kind]
-    after, step = _tuned(errors, rows, images)
+    after, step = tuned(errors, rows, images)
     # Every kind gives a third of the unknowns' degrees of freedom, and its part of theta's.
     touched = np.any(rows[..., unknowns:] != 0, axis=(0, 2))
     freedom = images - unknowns / 3 - touched * (_FREEDOM[kind] / touched.sum())
@@ -276,19 +262,3 @@ def _distortion(
     size = tracker_distortion.size(positions, used, found.variance)
     step = np.sqrt(found.variance) * found.response
     return [Unmodelled("distortion", np.array([size]), found.statistic, step)]
-
-
-def _tuned(
-    errors: Float[Array, "m 3"], rows: Float[Array, "m 3 q"], images: int
-) -> tuple[Float[Array, " 3"], Float[Array, " q"]]:
-    """Mean squared errors of each kind after the fit with tuned SDs, and the step."""
-    scale = 1 / np.sqrt(np.maximum(np.sum(rows**2, axis=(0, 1)), 1e-300))
-    variance = np.ones(3)
-    step = np.zeros(rows.shape[-1])
-    for _ in range(_ROUNDS):
-        weight = 1 / np.sqrt(variance)[:, None]
-        design = (rows * scale * weight).reshape(-1, rows.shape[-1])
-        step = -scale * np.linalg.lstsq(design, (errors * weight[:, 0]).ravel(), rcond=1e-12)[0]
-        left = errors + rows @ step
-        variance = np.maximum(np.sum(left**2, axis=0) / images, 1e-12)
-    return variance, step
