@@ -216,11 +216,31 @@ def test_a_bound_that_moves_the_answer_is_told_of(bound, least, most):
         without = jaxcal.calibrate(recording, prior="gaussian").image_to_probe
         mine, none = (np.asarray(x) for x in (result.image_to_probe, without))
         apart = distance(mine, none, np.ones(2), grid, 0.0)
-        assert tre["bound"]["moved_mm"] == pytest.approx(apart, rel=0.1)
-        if any("without the bound" in words for words in tre["contradictions"]):
+        moved = tre["gaussian_offsets"]["apart_mm"]
+        assert moved == pytest.approx(apart, rel=0.1)
+        if any("Gaussian offsets differs" in words for words in tre["contradictions"]):
             told += 1
-            assert tre["rms_mm"] > 0.999 * np.hypot(tre["stated_mm"], tre["bound"]["moved_mm"])
+            assert tre["rms_mm"] > 0.999 * np.hypot(
+                tre["stated_mm"], tre["gaussian_offsets"]["apart_mm"]
+            )
     assert least <= told <= most
+
+
+@pytest.mark.parametrize("law", ["normal", "uniform"])
+def test_uniform_offsets_that_are_not_uniform_are_told_of(law):
+    found = 0
+    for seed in range(100, 110):
+        recording = experiment(seed, images=IMAGES, elevation_distribution=law)
+        result = jaxcal.calibrate(recording, prior="uniform")
+        tre = calibration_record(result, recording)["tre"]
+        grid = region_of(result.numpy(), recording).grid()[:, [0, 2]]
+        mine, true = np.asarray(result.image_to_probe), recording.truth.image_to_probe
+        error = distance(mine, true, np.ones(2), grid, 0.0)
+        told = any("Gaussian offsets differs" in words for words in tre["contradictions"])
+        found += told
+        assert told or error < tre["stated_interval_mm"][1]
+        assert error < tre["interval_95_mm"][1]
+    assert found >= 3 if law == "normal" else found == 0
 
 
 def test_a_second_echo_in_forty_per_cent_of_the_images_is_told_of(answers):

@@ -67,7 +67,8 @@ SETTINGS: dict[str, tuple[str, ...]] = {
         "1000 clean recordings each of 12, 30 and 60 images, and 200 each with one of eight faults",
         "ranges 4 % too long",
         "200 recordings each of 12, 30 and 60 images, with uniform offsets up to 1 mm or normal "
-        "offsets with an SD of 1 mm, calibrated with `--prior bounded` and a bound of 0.25 to 4 mm",
+        "or heavy-tailed ones with an SD of 1 mm, calibrated with `--prior bounded` and a bound of "
+        "0.25 to 4 mm",
         "one mm at 20 mm to the side",
         "400 recordings each of 12, 30 and 60 images, and ranges that are too long by 1 mm at 20 "
         "mm to the side",

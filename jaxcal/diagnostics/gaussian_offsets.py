@@ -1,10 +1,10 @@
-"""The fit with Gaussian offsets and tuned SDs of the images of an answer within bounds.
+"""The fit with Gaussian offsets and tuned SDs, beside answers whose offsets have sharp limits.
 
 Offsets that are free within a bound hide errors: those that the model leaves out, and that of the
 bound itself. If it is larger than the offsets, all answers in an interval fit equally well; if
-offsets exceed it, they move the answer. If the bound is right, the fit with Gaussian offsets is
-also right, only less precise, and the answer is from it by no more than its own error (Hausman
-1978).
+offsets exceed it, they move the answer. So do offsets without sharp limits under a uniform
+distribution. If the limits are right, the fit with Gaussian offsets is also right, only less
+precise, and the answer is from it by no more than its own error (Hausman 1978).
 """
 
 from __future__ import annotations
@@ -13,12 +13,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaxcal.diagnostics.image_errors import ImageErrors, quadratic
+from jaxcal.diagnostics.image_errors import ImageErrors, Whitened, quadratic
 from jaxcal.diagnostics.intervals import image_jacobian
 from jaxcal.model.image_points import mean_of_squares
 from jaxcal.result.calibration import Calibration
-from jaxcal.runtime.array_types import Bool, Float
+from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.arrays import map_arrays
+from jaxcal.solvers.plan import TUNED
 
 Array = np.ndarray
 
@@ -28,7 +29,7 @@ FEWEST = 8
 _ROUNDS = 8
 """Rounds of tuning the SDs."""
 _STEPS = 4
-"""Gauss-Newton steps from an answer within bounds."""
+"""Gauss-Newton steps from the answer."""
 
 
 @dataclass(frozen=True)
@@ -37,29 +38,37 @@ class GaussianOffsets:
 
     Attributes:
         seen: the errors at it.
-        variance: mean squared errors of each kind, mm^2.
-        step: from the answer within bounds, in the order of the unknowns.
+        rows: their derivatives, :func:`shortened`, in SDs of the answer where it has SDs.
+        variance: mean squared errors of each kind, in the square of the same unit.
+        step: from the answer, in the order of the unknowns.
     """
 
     seen: ImageErrors
+    rows: Float[Array, "m 3 p"]
     variance: Float[Array, " 3"]
     step: Float[Array, " p"]
 
     @classmethod
-    def of(cls, seen: ImageErrors, used: Bool[Array, " n"]) -> GaussianOffsets:
-        """The fit from the errors at an answer within bounds (leading axis of length 1)."""
-        variance, whole = np.ones(3), np.zeros(seen.rows.shape[-1])
+    def of(cls, answer: Calibration) -> GaussianOffsets:
+        """The fit to the images of an answer (leading axis of length 1)."""
+        used = np.asarray(answer.mask)[0] > 0
+        images = int(used.sum())
+        seen = ImageErrors.of_answer(answer).centred(answer)
+        rows, variance, whole = seen.rows[0], np.ones(3), np.zeros(seen.rows.shape[-1])
         for _ in range(_STEPS):
-            variance, step = tuned(seen.errors[0][used], seen.rows[0][used], int(used.sum()))
-            seen = ImageErrors.of(
-                seen.unknowns.moved(step[None], seen.blocks), seen.problem, seen.blocks
-            )
+            scaled = in_sds(answer, seen)
+            errors, rows = shortened(scaled.errors[0][used], scaled.rows[0][used])
+            variance, step = tuned(errors, rows, images)
+            unknowns = seen.unknowns.moved(step[None], seen.blocks)
+            seen = ImageErrors.of(unknowns, seen.problem, seen.blocks).centred(answer)
             whole = whole + step
-        return cls(seen, variance, whole)
+        return cls(seen, rows, variance, whole)
 
 
-def moved_by_bound(answer: Calibration, grid: Float[Array, "m 2"]) -> tuple[float, float] | None:
-    """How far an answer within bounds is from the fit with Gaussian offsets, in the image, mm.
+def away_from_gaussian(
+    answer: Calibration, grid: Float[Array, "m 2"]
+) -> tuple[float, float] | None:
+    """How far an answer with sharp limits is from that with Gaussian offsets, in the image, mm.
 
     Args:
         answer: of one problem, on numpy arrays.
@@ -69,21 +78,35 @@ def moved_by_bound(answer: Calibration, grid: Float[Array, "m 2"]) -> tuple[floa
         The distance, and the error of the fit with Gaussian offsets by its own covariance, both
         root mean squares over the points; None for other answers and with few images.
     """
-    used = np.asarray(answer.mask) > 0
-    images = int(used.sum())
-    if answer.prior != "bounded" or answer.problem is None or images < FEWEST:
+    images = int(np.sum(np.asarray(answer.mask) > 0))
+    limited = answer.prior in ("bounded", "uniform") and answer.data == "points"
+    if answer.problem is None or not limited or images < FEWEST:
         return None
-    one = map_arrays(lambda leaf: np.asarray(leaf)[None], answer)
-    fit = GaussianOffsets.of(ImageErrors.of_answer(one), used)
-    rows = fit.seen.rows[0][used]
+    fit = GaussianOffsets.of(map_arrays(lambda leaf: np.asarray(leaf)[None], answer))
     # Every kind gives a third of the unknowns' degrees of freedom.
-    variance = fit.variance / (1 - rows.shape[-1] / (3 * images))
-    weighted = rows / variance[:, None]
-    information = np.einsum("mkp,mkq->pq", weighted, rows)
+    variance = fit.variance / (1 - fit.rows.shape[-1] / (3 * images))
+    information = np.einsum("mkp,mkq->pq", fit.rows / variance[:, None], fit.rows)
     weight = mean_of_squares(image_jacobian(answer, grid))
     error = np.trace(weight @ np.linalg.pinv(information, hermitian=True))
-    moved = quadratic(fit.step[None, None], weight[None])[0, 0]
-    return float(np.sqrt(moved)), float(np.sqrt(error))
+    apart = quadratic(fit.step[None, None], weight[None])[0, 0]
+    return float(np.sqrt(apart)), float(np.sqrt(error))
+
+
+def in_sds(answer: Calibration, seen: ImageErrors) -> Whitened | ImageErrors:
+    """Errors and rows in SDs; in mm for answers without SDs, which are tuned anyway."""
+    return Whitened.of(answer, seen) if answer.prior in TUNED else seen
+
+
+def shortened(
+    errors: Float[Array, "n 3"], rows: Float[Array, "n 3 q"]
+) -> tuple[Float[Array, "m 3"], Float[Array, "m 3 q"]]:
+    """At most q + 1 errors of each kind and their rows, for the same fits as all n of them.
+
+    The triangle of each kind's rows and errors has the same sums of squares.
+    """
+    both = np.concatenate([rows, errors[..., None]], axis=-1)
+    triangle = np.asarray(np.linalg.qr(np.swapaxes(both, 0, 1), mode="r"))
+    return triangle[..., -1].T, np.swapaxes(triangle[..., :-1], 0, 1)
 
 
 def tuned(

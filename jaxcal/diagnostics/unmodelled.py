@@ -37,8 +37,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from jaxcal.diagnostics import tracker_distortion
-from jaxcal.diagnostics.gaussian_offsets import GaussianOffsets, tuned
-from jaxcal.diagnostics.image_errors import ImageErrors, Whitened
+from jaxcal.diagnostics.gaussian_offsets import GaussianOffsets, in_sds, shortened, tuned
+from jaxcal.diagnostics.image_errors import ImageErrors
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Bool, Float
 from jaxcal.runtime.arrays import map_arrays
@@ -134,20 +134,18 @@ def unmodelled(calibration: Calibration) -> list[Unmodelled]:
     if calibration.problem is None or not fits or used.sum() < FEWEST:
         return []
     answer = map_arrays(lambda leaf: np.asarray(leaf)[None], calibration.numpy())
-    seen = ImageErrors.of_answer(answer).centred(answer)
-    if calibration.prior not in TUNED:
+    if calibration.prior in TUNED:
+        seen = ImageErrors.of_answer(answer).centred(answer)
+    else:
         # Offsets that are free within a bound absorb much of an error, above all a step.
-        seen = GaussianOffsets.of(seen, used).seen
+        seen = GaussianOffsets.of(answer).seen
     columns = _columns(seen, used)
     rows = np.concatenate([seen.rows[0], *(each for _, _, each in columns)], axis=-1)[None]
     found: list[Unmodelled] = []
     unknowns = at = seen.rows.shape[-1]
     with np.errstate(all="ignore"):
-        whitened = _whitened(answer, replace(seen, rows=rows))
-        both = np.concatenate([whitened.rows, whitened.errors[..., None]], axis=-1)[0][used]
-        # The triangle of each kind's rows and errors has the same sums of squares as all images.
-        triangle = np.asarray(np.linalg.qr(np.swapaxes(both, 0, 1), mode="r"))
-        rows, errors = np.swapaxes(triangle[..., :-1], 0, 1), triangle[..., -1].T
+        whitened = in_sds(answer, replace(seen, rows=rows))
+        errors, rows = shortened(whitened.errors[0][used], whitened.rows[0][used])
         before, _ = tuned(errors, rows[..., :unknowns], int(used.sum()))
         parts = []
         for kind, image, _ in columns:
@@ -162,11 +160,6 @@ def unmodelled(calibration: Calibration) -> list[Unmodelled]:
                 found.append(replace(each, image=image))
         found += _distortion(answer, seen, used)
     return sorted(found, key=lambda each: -each.statistic / _BY_CHANCE[each.kind])
-
-
-def _whitened(answer: Calibration, seen: ImageErrors) -> Whitened | ImageErrors:
-    """Errors and rows in SDs; in mm for answers without SDs, which are tuned again anyway."""
-    return Whitened.of(answer, seen) if answer.prior in TUNED else seen
 
 
 def _columns(
@@ -249,7 +242,7 @@ def _distortion(
     positions = np.asarray(seen.problem.poses)[0, :, :3, 3]
     columns = tracker_distortion.columns(seen, used)
     rows = np.concatenate([seen.rows[0], columns], axis=-1)[None]
-    whitened = _whitened(answer, replace(seen, rows=rows))
+    whitened = in_sds(answer, replace(seen, rows=rows))
     start = float(np.mean(seen.errors[0][used][:, :2] ** 2))
     errors, rows = whitened.errors[0][used], whitened.rows[0][used]
     found = tracker_distortion.fit(errors, rows, start)

@@ -23,7 +23,7 @@ from jaxcal.data.poses import targets_in_images
 from jaxcal.data.recording import LARGEST, Recording
 from jaxcal.design.candidates import seen_region
 from jaxcal.design.constraints import Region
-from jaxcal.diagnostics.gaussian_offsets import moved_by_bound
+from jaxcal.diagnostics.gaussian_offsets import away_from_gaussian
 from jaxcal.diagnostics.image_errors import KINDS, ImageErrors, noise_covariance
 from jaxcal.diagnostics.influence import (
     Influence,
@@ -92,8 +92,8 @@ def accuracy_record(
     tre["residuals_over_stated"] = math.sqrt(ratio) if ratio > 0 else None
     tre["chance"] = chance
     tre["unmodelled"] = _unmodelled(answer, grid)
-    moved = moved_by_bound(answer, grid)
-    tre["bound"] = moved and dict(zip(("moved_mm", "expected_mm"), moved, strict=True))
+    away = away_from_gaussian(answer, grid)
+    tre["gaussian_offsets"] = away and dict(zip(("apart_mm", "error_mm"), away, strict=True))
     agreeing = agreeing_outliers(answer, float(tre["stated_mm"]), grid)
     tre["left_out"] = agreeing and dict(zip(("images", "apart_mm"), agreeing, strict=True))
     return {

@@ -12,7 +12,8 @@ The covariance assumes that the noise model holds. It is contradicted if
   model leaves out (:mod:`jaxcal.diagnostics.unmodelled`);
 - images that were left out as outliers agree among themselves on another calibration
   (:mod:`jaxcal.diagnostics.outlier_agreement`);
-- a fit without the bound on the offsets is far away (:mod:`jaxcal.diagnostics.gaussian_offsets`).
+- offsets are bounded or uniform, and the fit with Gaussian offsets is far away
+  (:mod:`jaxcal.diagnostics.gaussian_offsets`).
 """
 
 from __future__ import annotations
@@ -31,9 +32,9 @@ share of the error, and by more than so many times the expected move."""
 TEST_TIMES = 3.0
 """Test images contradict the stated error if they scatter by more than so many times what the
 calibration's own errors and uncertainty explain."""
-BOUND_TIMES = 1.25
-"""A bound on the offsets contradicts the stated error if the answer is farther than so many times
-the error of a fit without the bound from that fit."""
+LIMITS_TIMES = 1.25
+"""Bounded or uniform offsets contradict the stated error if the answer is farther from the fit with
+Gaussian offsets than so many times the error of that fit."""
 SCATTER_TIMES = 1.3
 """Resampled calibrations may scatter by up to so many times the stated error."""
 
@@ -62,7 +63,7 @@ def contradictions(record: dict[str, Any]) -> list[tuple[float, str]]:
         _from_unmodelled,
         _from_groups,
         _from_left_out,
-        _from_bound,
+        _from_limits,
     )
     return [found for check in checks for found in check(record)]
 
@@ -202,20 +203,25 @@ def _from_left_out(record: dict[str, Any]) -> list[tuple[float, str]]:
     return [(math.hypot(1.0, found["apart_mm"] / stated), words)]
 
 
-def _from_bound(record: dict[str, Any]) -> list[tuple[float, str]]:
-    """An answer that a bound on the offsets has moved."""
-    found, stated = record["tre"]["bound"], record["tre"]["stated_mm"]
+def _from_limits(record: dict[str, Any]) -> list[tuple[float, str]]:
+    """An answer that sharp limits of the offsets have moved."""
+    found, stated = record["tre"]["gaussian_offsets"], record["tre"]["stated_mm"]
     if found is None or not stated:
         return []
-    moved, expected = found["moved_mm"], found["expected_mm"]
-    if moved <= BOUND_TIMES * expected:
+    apart, error = found["apart_mm"], found["error_mm"]
+    if apart <= LIMITS_TIMES * error:
         return []
+    better = "use the prior auto, unless something limits the offsets on both sides"
+    if record["prior"] == "bounded":
+        better = (
+            "give the largest distance of the target from the plane as the bound, not more and not "
+            "less, or use the prior auto, which needs no bound"
+        )
     words = (
-        f"a calibration without the bound on the offsets differs by {moved:.2f} mm, where its own "
-        f"error would be {expected:.2f} mm: give the largest distance of the target from the "
-        "plane, not more and not less, or use the prior auto, which needs no bound"
+        f"a calibration with Gaussian offsets differs by {apart:.2f} mm, where its own error would "
+        f"be {error:.2f} mm: {better}"
     )
-    return [(math.hypot(1.0, moved / stated), words)]
+    return [(math.hypot(1.0, apart / stated), words)]
 
 
 def _scatter(scatter: float, stated: float) -> str:
