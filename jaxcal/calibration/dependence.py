@@ -40,6 +40,7 @@ from jaxcal import InputError
 from jaxcal.data.poses import nearest_rotations
 from jaxcal.data.problem import Problem
 from jaxcal.data.recording import MINIMUM_IMAGES
+from jaxcal.diagnostics.frame_checks import wrong_frames
 from jaxcal.diagnostics.image_errors import ImageErrors
 from jaxcal.model.thresholds import MAD
 from jaxcal.model.unknowns import RIGID
@@ -406,7 +407,11 @@ def _stride(problem: Problem, estimate: tuple[str, ...]) -> int:
         correlation = autocorrelation(values)
         if correlation[1] * np.sqrt(len(values)) > STREAM_SCORE:
             time = max(time, correlation_time(correlation))
-    return int(time) if time >= LEAST_STREAM_TIME else 1
+    if time < LEAST_STREAM_TIME or wrong_frames(problem, estimate):
+        # Errors of wrong poses are alike for as long as the motion lasts, but no image has them:
+        # of the few that were kept, a fit would show nothing.
+        return 1
+    return int(time)
 
 
 def _moves_continuously(poses: Float[np.ndarray, "n 4 4"]) -> bool:
