@@ -617,6 +617,17 @@ def test_times_that_only_rounding_puts_beyond_the_poses_have_one(tmp_path):
     np.testing.assert_allclose(found.transforms[PAIR], moving(times), atol=5e-3)
 
 
+@pytest.mark.parametrize(("moments", "told"), [(MOMENTS[::40], True), (MOMENTS, False)])
+def test_poses_too_rare_for_the_motion_are_told(moments, told):
+    """Poses at 1.25 Hz were wrong by millimetres, without a word."""
+    times = np.linspace(moments[0], moments[-1], COUNT)
+    images, tracking = tracked(times, POSES), tracked(moments, swept(3 * moments))
+    _, notes = with_poses_by_time(images, tracking)
+    assert len(notes) == 1 + told
+    if told:
+        assert re.search(r"poses are 0\.8 s apart.* wrong by about \d+\.\d mm", notes[1])
+
+
 def to_and_fro(t: np.ndarray) -> np.ndarray:
     """An irregular motion, -1 to 1."""
     return (15 * np.sin(1.95 * t) + 7 * np.sin(5.2 * t + 1) + 3 * np.sin(10.7 * t)) / 25

@@ -40,6 +40,7 @@ from jaxcal import InputError
 from jaxcal.data.poses import nearest_rotations
 from jaxcal.data.problem import Problem
 from jaxcal.data.recording import MINIMUM_IMAGES
+from jaxcal.data.timing import LEVER_MM
 from jaxcal.diagnostics.frame_checks import wrong_frames
 from jaxcal.diagnostics.image_errors import ImageErrors
 from jaxcal.model.thresholds import MAD
@@ -50,9 +51,6 @@ from jaxcal.solvers.closed_form.single import solve_problem
 
 SAME_POSE_MM = 1.0
 """Two poses are the same if no point within the lever moves farther than this between them."""
-
-LEVER_MM = 100.0
-"""The lever, from the tracked origin: about the distance of a target from the probe's marker."""
 
 HOLD_MM = 3.0
 """Images linked by pairs of the same pose are one hold if they all lie within this."""
