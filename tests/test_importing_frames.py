@@ -277,7 +277,7 @@ def test_the_images_of_a_folder_are_told_by_name(tmp_path, folder, capsys):
 
 def test_images_without_a_pose_are_counted(tmp_path, folder):
     table = pose_table(tmp_path / "p.csv", "frame,", lambda k: f"{k + 2},", rows=[0, 1, 3, 4, 6])
-    recording, notes, frames = import_files([folder], ImportOptions(poses=table))
+    recording, notes, frames, _ = import_files([folder], ImportOptions(poses=table))
     assert len(recording) == 5
     assert f"4 of 9 images have no pose in {table}" in notes
     assert frames.counts["not tracked"] == 4
@@ -317,7 +317,9 @@ def test_a_folder_and_points(tmp_path, folder, column):
     names = [str(k + 2) if column == "frame" else f"b{k + 2}.png" for k in range(COUNT)]
     lines = [f"{name},{u!r},{v!r}" for name, (u, v) in zip(names, POINTS.tolist(), strict=True)]
     (tmp_path / "uv.csv").write_text("\n".join([f"{column},u,v", *lines[5:], *lines[1:4]]))
-    recording, _, frames = import_files([folder, tmp_path / "uv.csv"], ImportOptions(poses=table))
+    recording, _, frames, _ = import_files(
+        [folder, tmp_path / "uv.csv"], ImportOptions(poses=table)
+    )
     used = [1, 2, 3, 5, 6, 7, 8]
     np.testing.assert_allclose(recording.calibration.measurements, POINTS[used])
     np.testing.assert_allclose(recording.calibration.poses, POSES[used], atol=1e-9)
@@ -333,7 +335,7 @@ def test_picks_in_a_folder_name_the_images(tmp_path, folder):
         picks = Picks(out, "images", (COLUMNS, ROWS), COUNT, range(COUNT), images.files)
         picks.pick(k, *POINTS[k].tolist())
     table = pose_table(tmp_path / "p.csv", "frame,", lambda k: f"{k + 2},")
-    recording, _, _ = import_files([folder, out], ImportOptions(poses=table))
+    recording, *_ = import_files([folder, out], ImportOptions(poses=table))
     np.testing.assert_allclose(recording.calibration.measurements, POINTS[[0, 3, 4, 6]])
     np.testing.assert_allclose(recording.calibration.poses, POSES[[0, 3, 4, 6]], atol=1e-9)
 
@@ -679,7 +681,7 @@ def test_a_lag_is_estimated_from_frames(tmp_path, lagging):
     frames = [speckle(RNG, *point) for point in points]
     write_sequence(tmp_path / "f.igs.mha", {}, times, images=frames)
     options = ImportOptions(poses=tmp_path / "t.igs.mha", lag_s="auto")
-    recording, notes, results = import_files([tmp_path / "f.igs.mha"], options)
+    recording, notes, results, _ = import_files([tmp_path / "f.igs.mha"], options)
     assert float(re.search(r"images lag by (\S+) s", "".join(notes))[1]) == pytest.approx(
         0.08, abs=0.004
     )
@@ -722,7 +724,7 @@ def test_real_images_and_tracking_in_two_files(tmp_path, real_data):
         "\n".join(["frame,u,v", *(f"{k},{k}.5,{k}.25" for k in range(0, len(frames), 7))])
     )
     options = ImportOptions(poses=tracker, source=pair[0], target=pair[1], ignore_time=True)
-    recording, notes, _ = import_files([video, tmp_path / "p.csv"], options)
+    recording, notes, *_ = import_files([video, tmp_path / "p.csv"], options)
     poses, valid = tracked.poses(*pair)
     times = recording.calibration.time
     assert times is not None

@@ -36,11 +36,14 @@ class Imported(NamedTuple):
         recording: of the files.
         notes: what was assumed, left out and counted, in words.
         frames: what became of every frame, where the target was looked for in them.
+        most_lost: whether fewer than half of the frames, or of the points of another file, are in
+            the recording.
     """
 
     recording: Recording
     notes: list[str]
     frames: FrameResults | None = None
+    most_lost: bool = False
 
 
 def import_files(
@@ -160,10 +163,12 @@ def _from_sequence(
                 _search(sequence, valid, options) if results is None else results.of_tracked(valid)
             )
             used = _found_points(sequence, results, options.minimum)
+            given, what = len(sequence), "frames"
         else:
             where += f" with {os.fspath(points)}"
             notes += placed.notes + _mirrored(sequence, points)
             used = _usable_points(sequence, placed, valid)
+            given, what = len(placed.rows), "points"
         time, said = None, []
         if np.isfinite(sequence.time[used.rows]).all():
             time, said = _good_time(
@@ -186,10 +191,13 @@ def _from_sequence(
             where=where,
         )
     notes += used.notes + said
+    most_lost = len(used.rows) < given / 2
+    if most_lost:
+        notes.insert(0, f"only {len(used.rows)} of {given} {what} can be used: see below")
     # A table of poses does not name their frames.
     named = options.poses is None or kind_of(options.poses) != "table"
     recording = Recording(images, source=sequence.source, pose_frames=frames if named else None)
-    return Imported(recording, notes, results)
+    return Imported(recording, notes, results, most_lost)
 
 
 def _estimated_lag(
