@@ -676,6 +676,20 @@ def test_a_lag_is_estimated_from_points(tmp_path, lagging, capsys):
     assert "neither a number of seconds nor auto" in capsys.readouterr().err
 
 
+def test_times_that_go_back_are_told_to_be_those_of_the_poses(tmp_path, lagging):
+    """--ignore-time was said to import without times, but poses had been looked up by them."""
+    times, points = lagging
+    write_sequence(tmp_path / "i.igs.mha", {}, np.where(times > 3, times - 2, times))
+    lines = [f"{k},{u!r},{v!r}" for k, (u, v) in enumerate(points.tolist())]
+    (tmp_path / "p.csv").write_text("\n".join(["frame,u,v", *lines]))
+    sources = [tmp_path / "i.igs.mha", tmp_path / "p.csv"]
+    options = ImportOptions(poses=tmp_path / "t.igs.mha")
+    with pytest.raises(InputError, match="--ignore-time imports images with poses at such times"):
+        import_files(sources, options)
+    _, notes, *_ = import_files(sources, replace(options, ignore_time=True))
+    assert "if times are wrong, poses are, too" in notes[-1]
+
+
 def test_a_lag_is_estimated_from_frames(tmp_path, lagging):
     times, points = lagging[0][::2], lagging[1][::2]
     frames = [speckle(RNG, *point) for point in points]

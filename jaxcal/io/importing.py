@@ -115,21 +115,28 @@ def _naming_pose_units(options: ImportOptions, stated: bool = False) -> Iterator
 
 
 def _good_time(
-    time: Float[np.ndarray, " n"], place: Callable[[int], str], options: ImportOptions
+    time: Float[np.ndarray, " n"],
+    place: Callable[[int], str],
+    options: ImportOptions,
+    by_time: bool = False,
 ) -> tuple[Float[np.ndarray, " n"] | None, list[str]]:
     """The times, unless they repeat or go back, which mostly are two recordings in one; and notes.
 
-    ``place`` says where a row stands.
+    ``place`` says where a row stands, ``by_time`` whether poses were looked up by these times.
     """
     back = np.flatnonzero(np.diff(time) <= 0)
     if not len(back):
         return time, []
     if not options.ignore_time:
+        row = int(back[0]) + 1
+        guess = "too few digits, or " * bool(time[row] == time[row - 1])
+        then = "imports images with poses at such times" if by_time else "imports without times"
         raise InputError(
-            f"{place(int(back[0]) + 1)}: the time stamp is not later than the one before: two "
-            "recordings in one? (--ignore-time imports without times)"
+            f"{place(row)}: the time stamp is not later than the one before: {guess}two recordings "
+            f"in one? (--ignore-time {then})"
         )
-    return None, ["time stamps repeat or go back: not kept"]
+    wrong = ", but poses are those at these times: if times are wrong, poses are, too" * by_time
+    return None, [f"time stamps repeat or go back: not kept{wrong}"]
 
 
 def _from_sequence(
@@ -175,6 +182,7 @@ def _from_sequence(
                 sequence.time[used.rows],
                 lambda row: f"{sequence.source}: {sequence.frame_name(int(used.rows[row]))}",
                 options,
+                by_time=tracking is not None,
             )
         pixels = sequence.pixels
         size = None if pixels is None else (pixels.columns, pixels.rows)
