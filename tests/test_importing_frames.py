@@ -9,6 +9,7 @@ import shlex
 import struct
 import warnings
 import zlib
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta, timezone
 from pathlib import Path
 
@@ -679,7 +680,7 @@ def test_a_lag_is_estimated_from_points(tmp_path, lagging, capsys):
 def test_times_that_go_back_are_told_to_be_those_of_the_poses(tmp_path, lagging):
     """--ignore-time was said to import without times, but poses had been looked up by them."""
     times, points = lagging
-    write_sequence(tmp_path / "i.igs.mha", {}, np.where(times > 3, times - 2, times))
+    write_sequence(tmp_path / "i.igs.mha", {}, np.where(times > 3, times - 2.05, times))
     lines = [f"{k},{u!r},{v!r}" for k, (u, v) in enumerate(points.tolist())]
     (tmp_path / "p.csv").write_text("\n".join(["frame,u,v", *lines]))
     sources = [tmp_path / "i.igs.mha", tmp_path / "p.csv"]
