@@ -574,6 +574,16 @@ def test_matrices_that_are_no_calibration(matrix, message):
         transform_from_plus_matrix(matrix)
 
 
+def test_the_identity_of_a_configuration_is_no_calibration(tmp_path):
+    """What PLUS's examples and a new transform of Slicer hold."""
+    numbers = " ".join(str(value) for value in np.eye(4, dtype=int).ravel())
+    (tmp_path / "c.xml").write_text(f'<Transform From="Image" To="Probe" Matrix="{numbers}" />')
+    (tmp_path / "c.tfm").write_text(itk_text(np.eye(4)))
+    for name in ("c.xml", "c.tfm"):
+        with pytest.raises(InputError, match=rf"{name}: .* identity: it was not calibrated"):
+            load_calibration(tmp_path / name)
+
+
 def test_a_complex_matrix_is_no_calibration():
     with pytest.raises(InputError, match="the matrix must be an array of real numbers"):
         check_affine(np.eye(4, dtype=complex))
