@@ -536,6 +536,7 @@ def test_a_stated_unit_is_not_advised_against(tmp_path):
         ("results.xml", "jaxcal export, apply and compare read"),
         ("frame.png", "name the folder"),
         ("clip.mp4", "save its frames as PNG"),
+        ("scene.mrml", "save its sequence from Slicer as"),
         ("a.bag", "save its poses as a table"),
     ],
 )
