@@ -123,6 +123,12 @@ def wrong_frames(problem: Problem, estimate: tuple[str, ...] = ()) -> str | None
             f"by {extent:.2g} mm in them): do poses and points belong together, with times of one "
             "clock, and in which frames and conventions are the poses?"
         )
+    size = fit.scales * given.spacing
+    if not known and size.max() > PIXELS_MM[1]:
+        return (
+            f"the pixels come out as {size[0]:.3g} x {size[1]:.3g} mm: are the poses' translations "
+            "in mm?"
+        )
     return None
 
 
