@@ -236,7 +236,7 @@ def _steps(data: ImageData, farther: bool) -> Iterator[tuple[str, ImageData, flo
     for by in np.unique(np.linspace(1, most, MOST_SHIFTS).astype(int)).tolist():
         for words, rows_after in (("before", -by), ("after", by)):
             told = (
-                f"the pose of the row {words}: the two lists are one row out of step"
+                f"the pose of the row {words}: the two lists are one row out of step, or one lags"
                 if by == 1
                 else f"the pose about {by} rows {words}: are both stamped by one clock?"
             )
