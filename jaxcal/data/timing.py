@@ -155,7 +155,11 @@ def interpolation_error(
         Root mean square over the queries and over points up to ``LEVER_MM`` from the tracked
         origin, mm; 0 where nothing can be left out.
     """
-    times, squares = _increasing(t, "time of pose"), np.full(len(t), np.nan)
+    times = _increasing(t, "time of pose")
+    # Of a long tracking only the poses about the queries are looked at.
+    near = np.unique(_interval(times, query)[:, None] + np.arange(-1, 3))
+    near = near[(near >= 0) & (near < len(times))]
+    times, poses, squares = times[near], poses[near], np.full(len(near), np.nan)
     if len(times) < 4:
         return 0.0
     for first in (0, 1):
