@@ -238,7 +238,8 @@ def _steps(data: ImageData, farther: bool) -> Iterator[tuple[str, ImageData, flo
             told = (
                 f"the pose of the row {words}: the two lists are one row out of step, or one lags"
                 if by == 1
-                else f"the pose about {by} rows {words}: are both stamped by one clock (import: --lag)?"
+                else f"the pose about {by} rows {words}: are both stamped by one clock? (else "
+                "import with --lag)"
             )
             factor = FACTOR if by == 1 else FARTHER
             yield f"each point belongs to {told}", _out_of_step(data, rows_after), factor
