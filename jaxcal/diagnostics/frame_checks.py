@@ -68,8 +68,8 @@ motion some wrong one is near to the poses by chance."""
 FEWEST_IN_STEP = 20
 """Fewest images that a shift by several rows must leave, besides half of them."""
 
-MOST_SHIFTS = 200
-"""Most shifts that are tried in each direction, evenly spread."""
+EVERY_SHIFT = 200
+"""Every shift by up to so many rows is tried, and half as many larger ones in geometric steps."""
 
 UNFIT, UNFIT_MM = 0.5, 5.0
 """Images do not fit together if their median error exceeds both this share of the target's motion
@@ -233,7 +233,9 @@ def _steps(data: ImageData, farther: bool) -> Iterator[tuple[str, ImageData, flo
     if count <= 5:
         return
     most = max(1, min(count // 2, count - FEWEST_IN_STEP)) if farther else 1
-    for by in np.unique(np.linspace(1, most, MOST_SHIFTS).astype(int)).tolist():
+    near = min(most, EVERY_SHIFT)
+    shifts = np.r_[1 : near + 1, np.geomspace(near, most, EVERY_SHIFT // 2)].astype(int)
+    for by in np.unique(shifts).tolist():
         for words, rows_after in (("before", -by), ("after", by)):
             told = (
                 f"the pose of the row {words}: the two lists are one row out of step, or one lags"
