@@ -10,7 +10,7 @@ of a millisecond. Where a corrected fit is far better, the slip is reported.
 f the sum of squares as given and f' the corrected one, the likelihood ratio is
 (f / f')^((3 n - p) / 2). It must exceed ``ODDS``, so that chance is ruled out although some twenty
 slips are tried. And f must exceed ``FACTOR`` times f', so that imperfect but correct data are not
-reported. If the images hardly fit together, poses and points are also shifted by up to half the
+reported. If the images fit badly, poses and points are also shifted by up to half the
 recording, as where they were stamped by two clocks; for these shifts f must exceed ``FARTHER``
 times f'.
 
@@ -104,7 +104,7 @@ def wrong_frames(problem: Problem, estimate: tuple[str, ...] = ()) -> str | None
     apart, extent = _typical_error(given, fit)
     corrected = [(words, replace(given, **changed), FACTOR) for words, changed in _slips(given)]
     best, told, least = before, None, FACTOR
-    for words, data, factor in chain(corrected, _steps(images, farther=apart > UNFIT_MM)):
+    for words, data, factor in chain(corrected, _steps(images, farther=apart > UNFIT_MM / 2)):
         other = _free_fit(data)
         if other is None:
             continue
