@@ -889,6 +889,8 @@ def test_plans_that_cannot_be(capfd, tmp_path):
         (["--lateral", 30], "reaches 29.2 mm to either side"),
         (["--images", 2], "between 4 and"),
         (["--depth", 0.02, 0.05], "the far one 1 to 5000, not (0.02, 0.05)"),
+        (["--lateral", 0.02], "--lateral is in mm, and 0.02 is too small: was it in metres?"),
+        (["--sigma", 2e-4, 3e-4, 1e-3], "--sigma is in mm, and 0.001 is too small"),
         (["--cone", 86], "'86' is not zero or a positive number up to 85"),
         (["--turn", "nan"], "'nan' is not zero or a positive number up to 180"),
         ([tmp_path / "absent.h5"], "absent"),

@@ -29,6 +29,7 @@ from jaxcal.calibration.resampling import relative_twist
 from jaxcal.calibration.serial_correlation import _cosine_transform, _covariances, widened
 from jaxcal.data.problem import Channels
 from jaxcal.data.recording import make_images
+from jaxcal.diagnostics import frame_checks
 from jaxcal.diagnostics.influence import WhitenedErrors, influence_of, whitened_errors
 from jaxcal.report.accuracy import GOOD_MM
 from jaxcal.report.record import calibration_record, further_unknowns
@@ -382,6 +383,16 @@ def test_another_sound_speed_costs_no_images_where_it_is_estimated(frames):
         problem = jaxcal.Problem.from_recording(images)
         assert independent(problem)[1].stride > 1
         assert independent(problem, ("sound-speed",))[1].stride == 1
+
+
+@pytest.mark.parametrize(("by", "words"), [(1, "one row out of step"), (20, "about 20 rows after")])
+def test_poses_of_other_times_are_told_and_cost_no_images(frames, by, words):
+    """Their errors are alike for as long as the motion lasts, and a few images would fit them."""
+    made = frames.swept(120, 0.05, np.random.default_rng([5, 1]))
+    poses, points = made.poses[::10], made.points[::10]
+    joined, found = independent(jaxcal.Problem.from_arrays(poses[:-by], points[by:]))
+    assert found.images == len(points) - by > 1.4 * frame_checks.MOST_IMAGES
+    assert words in (frame_checks.wrong_frames(joined) or "")
 
 
 def test_negligible_errors_cost_no_images_however_slowly_they_change():

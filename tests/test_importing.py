@@ -86,7 +86,7 @@ MATRIX = [f"m{i}{j}" for i in range(1, 4) for j in range(1, 5)]
 )  # fmt: skip
 def test_headers_are_read(tmp_path, lines):
     (tmp_path / "t.csv").write_text("\n".join(lines))
-    recording, notes, _ = import_files([tmp_path / "t.csv"])
+    recording, notes, *_ = import_files([tmp_path / "t.csv"])
     images = recording.calibration
     np.testing.assert_allclose(images.poses, POSES, atol=1e-11)
     np.testing.assert_allclose(images.measurements, PIXELS, rtol=1e-14)
@@ -161,7 +161,7 @@ def test_invalid_rows_are_counted(tmp_path):
     (tmp_path / "t.csv").write_text("\n".join([*lines, *more]))
     with pytest.raises(FormatError, match=r"t\.csv:8: the row is marked as invalid"):
         import_files([tmp_path / "t.csv"])
-    recording, notes, _ = import_files([tmp_path / "t.csv"], ImportOptions(skip_invalid=True))
+    recording, notes, *_ = import_files([tmp_path / "t.csv"], ImportOptions(skip_invalid=True))
     assert len(recording) == 6
     assert notes == [f"{tmp_path / 't.csv'}: 4 invalid rows left out"]
 
@@ -179,7 +179,7 @@ def test_a_pose_of_zeros_is_that_of_a_tool_not_seen(tmp_path):
 def test_empty_rows_at_the_end_do_not_count(tmp_path):
     lines = table(NAMES, COLUMNS)
     (tmp_path / "t.csv").write_text("\n".join([*lines, ",,,,,,,,", ",,,", ""]))
-    recording, notes, _ = import_files([tmp_path / "t.csv"])
+    recording, notes, *_ = import_files([tmp_path / "t.csv"])
     assert (len(recording), notes) == (6, [])
 
 
@@ -231,13 +231,13 @@ def test_times_that_go_back(tmp_path):
         InputError, match=r"t\.csv:5: the time stamp is not later than the one before"
     ):
         import_files([tmp_path / "t.csv"])
-    recording, notes, _ = import_files([tmp_path / "t.csv"], ImportOptions(ignore_time=True))
+    recording, notes, *_ = import_files([tmp_path / "t.csv"], ImportOptions(ignore_time=True))
     assert recording.calibration.time is None
     assert "not kept" in notes[0]
     (tmp_path / "t.csv").write_text(
         "\n".join([*lines[:3], lines[3][lines[3].index(",") :], *lines[4:]])
     )
-    recording, notes, _ = import_files([tmp_path / "t.csv"], ImportOptions(ignore_time=True))
+    recording, notes, *_ = import_files([tmp_path / "t.csv"], ImportOptions(ignore_time=True))
     assert (len(recording), recording.calibration.time) == (6, None)
     assert notes == ["time stamps are missing or cannot be read: not kept"]
 
@@ -245,7 +245,7 @@ def test_times_that_go_back(tmp_path):
 def test_ignoring_bad_times_keeps_good_ones(tmp_path):
     """Those of a table like those of a sequence."""
     (tmp_path / "t.csv").write_text("\n".join(table(["time", *NAMES], [np.arange(6.0), *COLUMNS])))
-    recording, notes, _ = import_files([tmp_path / "t.csv"], ImportOptions(ignore_time=True))
+    recording, notes, *_ = import_files([tmp_path / "t.csv"], ImportOptions(ignore_time=True))
     np.testing.assert_array_equal(recording.calibration.time, np.arange(6.0))
     assert notes == []
 
@@ -391,7 +391,7 @@ def fcsv(sign):
 )
 def test_points_of_a_sequence(tmp_path, sequence, name, text, points):
     (tmp_path / name).write_text(text)
-    recording, notes, _ = import_files([sequence, tmp_path / name], ImportOptions(points=points))
+    recording, notes, *_ = import_files([sequence, tmp_path / name], ImportOptions(points=points))
     images = recording.calibration
     np.testing.assert_allclose(images.poses, POSES[KEPT], atol=1e-11)
     np.testing.assert_allclose(images.measurements, PIXELS[KEPT], rtol=1e-14)
@@ -478,7 +478,7 @@ def test_transforms_without_a_status_are_told_once(tmp_path, sequence, apart):
     told = "s.igs.mha: ProbeToTracker without a status is taken as OK"
     for pattern, times in ((rb"Stylus", 0), (rb"(Seq_Frame000[13]_ProbeTo\w+Status) = OK\n", 1)):
         sequence.write_bytes(re.sub(pattern, b"", content))
-        recording, notes, _ = import_files([sequence, tmp_path / "p.csv"], options)
+        recording, notes, *_ = import_files([sequence, tmp_path / "p.csv"], options)
         assert "\n".join(notes).count("without a status") == times
         assert "\n".join(notes).count(told) == times
         assert len(recording.calibration) == len(KEPT)
@@ -536,6 +536,7 @@ def test_a_stated_unit_is_not_advised_against(tmp_path):
         ("results.xml", "jaxcal export, apply and compare read"),
         ("frame.png", "name the folder"),
         ("clip.mp4", "save its frames as PNG"),
+        ("scene.mrml", "save its sequence from Slicer as"),
         ("a.bag", "save its poses as a table"),
     ],
 )
@@ -618,9 +619,26 @@ def test_points_of_images_that_were_not_ok(tmp_path):
     old = b"Seq_Frame0003_ImageStatus = "
     path.write_bytes(path.read_bytes().replace(old + b"OK", old + b"INVALID"))
     (tmp_path / "p.csv").write_text(POINTS_OF_SIX)
-    recording, notes, _ = import_files([path, tmp_path / "p.csv"])
+    recording, notes, *_ = import_files([path, tmp_path / "p.csv"])
     np.testing.assert_allclose(recording.calibration.poses, POSES[[0, 1, 2, 4, 5]], atol=1e-11)
     assert "1 point left out, in frames whose image was not OK" in notes
+
+
+@pytest.mark.parametrize("lost", [4, 6])
+def test_points_of_which_most_have_no_pose_end_with_status_3(tmp_path, capsys, lost):
+    path, out = tmp_path / "s.igs.mha", tmp_path / "o.h5"
+    write_sequence(path, {PROBE: random_poses(10)}, np.arange(10.0))
+    header = re.sub(
+        rb"(Frame000[0-%d]_ProbeTo\w+Status = )OK" % (lost - 1), rb"\1INVALID", path.read_bytes()
+    )
+    path.write_bytes(header)
+    (tmp_path / "p.csv").write_text("frame,u,v\n" + "".join(f"{k},{k}.5,9\n" for k in range(10)))
+    status = main(["import", str(path), str(tmp_path / "p.csv"), str(out)])
+    told = capsys.readouterr().out.splitlines()[1]
+    assert (status, told == "- only 4 of 10 points can be used: see below") == (
+        (3, True) if lost == 6 else (0, False)
+    )
+    assert len(jaxcal.load(out)) == 10 - lost
 
 
 @pytest.mark.parametrize(
@@ -720,7 +738,7 @@ def test_markups_are_ras(tmp_path):
 def test_poses_that_are_stored_from_the_tracker(tmp_path, stored, told):
     write_sequence(tmp_path / "s.igs.mha", stored, np.arange(6.0))
     (tmp_path / "p.csv").write_text(POINTS_OF_SIX)
-    recording, notes, _ = import_files([tmp_path / "s.igs.mha", tmp_path / "p.csv"])
+    recording, notes, *_ = import_files([tmp_path / "s.igs.mha", tmp_path / "p.csv"])
     np.testing.assert_allclose(recording.calibration.poses, np.linalg.inv(POSES), atol=1e-10)
     assert f"poses from {told}" in notes[0]
 

@@ -9,6 +9,7 @@ import shlex
 import struct
 import warnings
 import zlib
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta, timezone
 from pathlib import Path
 
@@ -277,7 +278,7 @@ def test_the_images_of_a_folder_are_told_by_name(tmp_path, folder, capsys):
 
 def test_images_without_a_pose_are_counted(tmp_path, folder):
     table = pose_table(tmp_path / "p.csv", "frame,", lambda k: f"{k + 2},", rows=[0, 1, 3, 4, 6])
-    recording, notes, frames = import_files([folder], ImportOptions(poses=table))
+    recording, notes, frames, _ = import_files([folder], ImportOptions(poses=table))
     assert len(recording) == 5
     assert f"4 of 9 images have no pose in {table}" in notes
     assert frames.counts["not tracked"] == 4
@@ -317,7 +318,9 @@ def test_a_folder_and_points(tmp_path, folder, column):
     names = [str(k + 2) if column == "frame" else f"b{k + 2}.png" for k in range(COUNT)]
     lines = [f"{name},{u!r},{v!r}" for name, (u, v) in zip(names, POINTS.tolist(), strict=True)]
     (tmp_path / "uv.csv").write_text("\n".join([f"{column},u,v", *lines[5:], *lines[1:4]]))
-    recording, _, frames = import_files([folder, tmp_path / "uv.csv"], ImportOptions(poses=table))
+    recording, _, frames, _ = import_files(
+        [folder, tmp_path / "uv.csv"], ImportOptions(poses=table)
+    )
     used = [1, 2, 3, 5, 6, 7, 8]
     np.testing.assert_allclose(recording.calibration.measurements, POINTS[used])
     np.testing.assert_allclose(recording.calibration.poses, POSES[used], atol=1e-9)
@@ -333,7 +336,7 @@ def test_picks_in_a_folder_name_the_images(tmp_path, folder):
         picks = Picks(out, "images", (COLUMNS, ROWS), COUNT, range(COUNT), images.files)
         picks.pick(k, *POINTS[k].tolist())
     table = pose_table(tmp_path / "p.csv", "frame,", lambda k: f"{k + 2},")
-    recording, _, _ = import_files([folder, out], ImportOptions(poses=table))
+    recording, *_ = import_files([folder, out], ImportOptions(poses=table))
     np.testing.assert_allclose(recording.calibration.measurements, POINTS[[0, 3, 4, 6]])
     np.testing.assert_allclose(recording.calibration.poses, POSES[[0, 3, 4, 6]], atol=1e-9)
 
@@ -617,6 +620,17 @@ def test_times_that_only_rounding_puts_beyond_the_poses_have_one(tmp_path):
     np.testing.assert_allclose(found.transforms[PAIR], moving(times), atol=5e-3)
 
 
+@pytest.mark.parametrize(("moments", "told"), [(MOMENTS[::40], True), (MOMENTS, False)])
+def test_poses_too_rare_for_the_motion_are_told(moments, told):
+    """Poses at 1.25 Hz were wrong by millimetres, without a word."""
+    times = np.linspace(moments[0], moments[-1], COUNT)
+    images, tracking = tracked(times, POSES), tracked(moments, swept(3 * moments))
+    _, notes = with_poses_by_time(images, tracking)
+    assert len(notes) == 1 + told
+    if told:
+        assert re.search(r"poses are 0\.8 s apart.* wrong by about \d+\.\d mm", notes[1])
+
+
 def to_and_fro(t: np.ndarray) -> np.ndarray:
     """An irregular motion, -1 to 1."""
     return (15 * np.sin(1.95 * t) + 7 * np.sin(5.2 * t + 1) + 3 * np.sin(10.7 * t)) / 25
@@ -663,12 +677,26 @@ def test_a_lag_is_estimated_from_points(tmp_path, lagging, capsys):
     assert "neither a number of seconds nor auto" in capsys.readouterr().err
 
 
+def test_times_that_go_back_are_told_to_be_those_of_the_poses(tmp_path, lagging):
+    """--ignore-time was said to import without times, but poses had been looked up by them."""
+    times, points = lagging
+    write_sequence(tmp_path / "i.igs.mha", {}, np.where(times > 3, times - 2.05, times))
+    lines = [f"{k},{u!r},{v!r}" for k, (u, v) in enumerate(points.tolist())]
+    (tmp_path / "p.csv").write_text("\n".join(["frame,u,v", *lines]))
+    sources = [tmp_path / "i.igs.mha", tmp_path / "p.csv"]
+    options = ImportOptions(poses=tmp_path / "t.igs.mha")
+    with pytest.raises(InputError, match="--ignore-time imports images with poses at such times"):
+        import_files(sources, options)
+    _, notes, *_ = import_files(sources, replace(options, ignore_time=True))
+    assert "if times are wrong, poses are, too" in notes[-1]
+
+
 def test_a_lag_is_estimated_from_frames(tmp_path, lagging):
     times, points = lagging[0][::2], lagging[1][::2]
     frames = [speckle(RNG, *point) for point in points]
     write_sequence(tmp_path / "f.igs.mha", {}, times, images=frames)
     options = ImportOptions(poses=tmp_path / "t.igs.mha", lag_s="auto")
-    recording, notes, results = import_files([tmp_path / "f.igs.mha"], options)
+    recording, notes, results, _ = import_files([tmp_path / "f.igs.mha"], options)
     assert float(re.search(r"images lag by (\S+) s", "".join(notes))[1]) == pytest.approx(
         0.08, abs=0.004
     )
@@ -711,7 +739,7 @@ def test_real_images_and_tracking_in_two_files(tmp_path, real_data):
         "\n".join(["frame,u,v", *(f"{k},{k}.5,{k}.25" for k in range(0, len(frames), 7))])
     )
     options = ImportOptions(poses=tracker, source=pair[0], target=pair[1], ignore_time=True)
-    recording, notes, _ = import_files([video, tmp_path / "p.csv"], options)
+    recording, notes, *_ = import_files([video, tmp_path / "p.csv"], options)
     poses, valid = tracked.poses(*pair)
     times = recording.calibration.time
     assert times is not None

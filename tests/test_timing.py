@@ -15,6 +15,7 @@ from jaxcal.data.timing import (
     estimate_latency,
     fit_clock,
     interpolate_poses,
+    interpolation_error,
     motion_along_main_axis,
 )
 
@@ -61,6 +62,31 @@ def test_a_smooth_motion_at_125_hz() -> None:
     assert error.max() < 2e-3
     nearest = path(t)[np.abs(t[:, None] - query).argmin(axis=0)]
     assert np.linalg.norm((nearest - path(query))[:, :3, 3], axis=1).max() > 0.15
+
+
+def wandering(t: np.ndarray) -> np.ndarray:
+    """Poses of a probe that moves and turns irregularly, with periods of 5 to 12 s."""
+    poses = np.tile(np.eye(4), (len(t), 1, 1))
+    waves = np.sin(t[:, None] * [0.53, 0.71, 1.23, 0.6, 0.9, 1.1] + np.arange(6))
+    poses[:, :3, :3] = Rotation.from_rotvec(0.2 * waves[:, :3]).as_matrix()
+    poses[:, :3, 3] = 30 * waves[:, 3:]
+    return poses
+
+
+@pytest.mark.parametrize("interval", [0.1, 0.5, 1.0])
+def test_the_error_of_interpolation_is_told_from_the_poses(interval: float) -> None:
+    rng = np.random.default_rng(2)
+    t = np.cumsum(rng.uniform(0.8, 1.2, round(60 / interval))) * interval
+    query = rng.uniform(t[0], t[-1], 400)
+    apart = interpolate_poses(t, wandering(t), query, max_gap_s=9.0) - wandering(query)
+    # On the axes of the probe, up to 100 mm from the tracked origin.
+    places = np.concatenate([np.vstack([np.zeros(3), 100 * np.eye(3)]), np.ones((4, 1))], axis=1)
+    true = np.sqrt(np.mean(np.sum((apart[:, :3] @ places.T) ** 2, axis=1)))
+    assert interpolation_error(t, wandering(t), query, max_gap_s=9.0) == pytest.approx(
+        true, rel=0.25
+    )
+    # Exactly at a pose nothing is interpolated.
+    assert interpolation_error(t, wandering(t), t[5:9], max_gap_s=9.0) == 0
 
 
 def test_no_pose_is_guessed() -> None:
@@ -133,6 +159,13 @@ def test_clock_refuses_what_is_no_clock() -> None:
         fit_clock(np.zeros(1), np.zeros(1))
     with pytest.raises(InputError, match="3 numbers"):
         fit_clock(np.arange(3.0), np.array([0.0, np.nan, 1.0]))
+    for host in (-np.arange(3.0), np.zeros(3)):
+        with pytest.raises(InputError, match="must increase with the device times"):
+            fit_clock(np.arange(3.0), host)
+    nanoseconds = 1.7e18 + 1e9 * np.arange(3.0)
+    for times in ((np.arange(3.0), nanoseconds), (nanoseconds, np.arange(3.0))):
+        with pytest.raises(InputError, match=r"times of 1\.7e\+18 are no seconds"):
+            fit_clock(*times)
 
 
 def motion(t: np.ndarray) -> np.ndarray:

@@ -301,6 +301,22 @@ def test_tus_rec_counts_from_one(tmp_path):
     np.testing.assert_allclose(counted[:3], known.apply(pixel).points[0], atol=1e-11)
 
 
+def test_a_calib_matrix_with_further_lines(tmp_path):
+    """UCL's own has a unit after a heading, and the lag of the images."""
+    known = random_transform()
+    path = tmp_path / "calib_matrix.csv"
+    known.save(path)
+    text = path.read_text()
+    path.write_text(text.replace("_to_mm\n", "_to_mm_unit\n") + "time_difference\n0.2s\n")
+    pixel = np.array([17.0, 230.0])
+    found = load_calibration(path).apply(pixel).points
+    np.testing.assert_allclose(found, known.apply(pixel).points, atol=1e-11)
+    for wrong in (text.replace("spatial", "special"), text.splitlines()[0] + "\n"):
+        path.write_text(wrong)
+        with pytest.raises(InputError, match="its first ten lines are"):
+            load_calibration(path)
+
+
 def test_tus_rec_scan(tmp_path):
     rng = np.random.default_rng(0)
     frames = rng.integers(0, 256, (5, 8, 9), dtype=np.uint8)
@@ -572,6 +588,16 @@ def test_json_that_lies(tmp_path, change, message):
 def test_matrices_that_are_no_calibration(matrix, message):
     with pytest.raises(InputError, match=message):
         transform_from_plus_matrix(matrix)
+
+
+def test_the_identity_of_a_configuration_is_no_calibration(tmp_path):
+    """What PLUS's examples and a new transform of Slicer hold."""
+    numbers = " ".join(str(value) for value in np.eye(4, dtype=int).ravel())
+    (tmp_path / "c.xml").write_text(f'<Transform From="Image" To="Probe" Matrix="{numbers}" />')
+    (tmp_path / "c.tfm").write_text(itk_text(np.eye(4)))
+    for name in ("c.xml", "c.tfm"):
+        with pytest.raises(InputError, match=rf"{name}: .* identity: it was not calibrated"):
+            load_calibration(tmp_path / name)
 
 
 def test_a_complex_matrix_is_no_calibration():

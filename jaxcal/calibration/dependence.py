@@ -40,6 +40,8 @@ from jaxcal import InputError
 from jaxcal.data.poses import nearest_rotations
 from jaxcal.data.problem import Problem
 from jaxcal.data.recording import MINIMUM_IMAGES
+from jaxcal.data.timing import LEVER_MM
+from jaxcal.diagnostics.frame_checks import wrong_frames
 from jaxcal.diagnostics.image_errors import ImageErrors
 from jaxcal.model.thresholds import MAD
 from jaxcal.model.unknowns import RIGID
@@ -49,9 +51,6 @@ from jaxcal.solvers.closed_form.single import solve_problem
 
 SAME_POSE_MM = 1.0
 """Two poses are the same if no point within the lever moves farther than this between them."""
-
-LEVER_MM = 100.0
-"""The lever, from the tracked origin: about the distance of a target from the probe's marker."""
 
 HOLD_MM = 3.0
 """Images linked by pairs of the same pose are one hold if they all lie within this."""
@@ -406,7 +405,11 @@ def _stride(problem: Problem, estimate: tuple[str, ...]) -> int:
         correlation = autocorrelation(values)
         if correlation[1] * np.sqrt(len(values)) > STREAM_SCORE:
             time = max(time, correlation_time(correlation))
-    return int(time) if time >= LEAST_STREAM_TIME else 1
+    if time < LEAST_STREAM_TIME or wrong_frames(problem, estimate):
+        # Errors of wrong poses are alike for as long as the motion lasts, but no image has them:
+        # of the few that were kept, a fit would show nothing.
+        return 1
+    return int(time)
 
 
 def _moves_continuously(poses: Float[np.ndarray, "n 4 4"]) -> bool:

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from jaxcal.data.recording import Recording
-    from jaxcal.io.target_search import FrameResults
 
 
 class ExitCode(enum.IntEnum):
@@ -116,10 +115,9 @@ def exit_code(records: Iterable[dict[str, Any]]) -> ExitCode:
     return ExitCode.CONVERGED if converged else ExitCode.NOT_CONVERGED
 
 
-def import_code(frames: FrameResults | None) -> ExitCode:
-    """3 where the target was looked for in frames, and most of them had to be left out."""
-    lost = frames is not None and frames.most_lost
-    return ExitCode.NOT_CONVERGED if lost else ExitCode.CONVERGED
+def import_code(most_lost: bool) -> ExitCode:
+    """3 where most frames, or points of another file, had to be left out."""
+    return ExitCode.NOT_CONVERGED if most_lost else ExitCode.CONVERGED
 
 
 WORDS = ("good", "fair", "uncertain")

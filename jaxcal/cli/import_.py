@@ -60,11 +60,11 @@ def import_(sources: tuple[str, ...], out: str, add_to: str | None, **options: A
         if first is not None and len(sources) == 1 and is_hdf5_recording(sources[0]):
             if ImportOptions(**options) != ImportOptions():
                 raise InputError(f"{sources[0]}: is a recording: only --add-to goes with it")
-            recording, notes, frames = load(sources[0]), [], None
+            recording, notes, frames, most_lost = load(sources[0]), [], None, False
         else:
             least = MINIMUM_IMAGES if first is None else 1
             asked = ImportOptions(**options, minimum=least)
-            recording, notes, frames = import_files(sources, asked)
+            recording, notes, frames, most_lost = import_files(sources, asked)
     if first is None:
         save(recording, out, frames)
     else:
@@ -89,7 +89,7 @@ def import_(sources: tuple[str, ...], out: str, add_to: str | None, **options: A
         click.echo(f"- {note}")
     for line in [] if frames is None else by_hand(sources[0], frames, options):
         click.echo(line)
-    return import_code(frames)
+    return import_code(most_lost)
 
 
 def _check(sources: tuple[str, ...], out: str, add_to: str | None, options: dict[str, Any]) -> None:

@@ -36,6 +36,9 @@ if TYPE_CHECKING:
 _COUNTED = (0.5, 0.3, 0.2, 0.1)
 """Errors (mm) for which the images are counted, where none is asked for."""
 
+_LEAST_LATERAL_MM, _LEAST_SIGMA_MM = 0.1, 0.01
+"""What is less was given in metres; for --sigma, all three."""
+
 _PICTURES = (
     b"\x89PNG",
     b"\xff\xd8\xff",  # JPEG
@@ -161,6 +164,12 @@ def plan(
         raise InputError("--estimate needs a recording")
     if recording is not None and sigma is not None:
         raise InputError("--sigma cannot be used with a recording: its images determine the SDs")
+    for name, largest, least in (
+        ("--lateral", lateral, _LEAST_LATERAL_MM),
+        ("--sigma", sigma and max(sigma), _LEAST_SIGMA_MM),
+    ):
+        if largest is not None and largest < least:
+            raise InputError(f"{name} is in mm, and {largest:g} is too small: was it in metres?")
     import_engine()
     from jaxcal import design
     from jaxcal.design.count import plan_until

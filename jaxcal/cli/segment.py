@@ -178,7 +178,7 @@ def _segment_frames(source: str, out: str | None, as_json: bool, options: dict[s
     if os.path.exists(source):
         check_writable(target)
     with progress("segmenting"):
-        recording, notes, found = import_files([source], ImportOptions(**options))
+        recording, notes, found, most_lost = import_files([source], ImportOptions(**options))
     assert found is not None
     save(recording, target, found)
     if as_json:
@@ -189,7 +189,7 @@ def _segment_frames(source: str, out: str | None, as_json: bool, options: dict[s
         count = f"{len(found.found)} of {len(found)} frames segmented ({found.target})"
         told = (f"{target}: {count}{hint}", *(f"- {note}" for note in notes))
         print_page(*told, *by_hand(source, found, options))
-    return import_code(found)
+    return import_code(most_lost)
 
 
 def _frames_record(

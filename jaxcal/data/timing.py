@@ -24,10 +24,15 @@ from jaxcal.runtime.messages import seconds
 MINIMUM_MOTION_MM = 8.0
 """Least motion from which a latency is estimated."""
 
+LEVER_MM = 100.0
+"""The lever, from the tracked origin: about the distance of a target from the probe's marker."""
+
 _SHORTEST_OVERLAP_S = 1.0
 _RIVAL = 0.98
 _MINIMUM_CORRELATION = 0.8
 _MOST_STEPS = 1_000_000
+_COARSEST_S = 1e-3
+"""A clock's times, as seconds, have digits for at least a millisecond."""
 _PARABOLA_S = 0.005
 
 
@@ -131,6 +136,53 @@ def interpolate_poses(
     return result
 
 
+def interpolation_error(
+    t: np.ndarray, poses: np.ndarray, query: np.ndarray, *, max_gap_s: float
+) -> float:
+    """About how wrong :func:`interpolate_poses` is, from poses that are left out and interpolated.
+
+    Between poses h apart, the path's acceleration a gives an error of a s (1 - s) h^2 / 2 at the
+    share s of the way. A pose that is interpolated from its two neighbours shows a; the tracker's
+    noise counts as well. Of faster motions than the poses can show it is an underestimate.
+
+    Args:
+        t: (n,) times of the poses, s, increasing.
+        poses: (n, 4, 4), mm.
+        query: (m,) times between them, s.
+        max_gap_s: poses whose neighbours are farther apart than twice this are not left out.
+
+    Returns:
+        Root mean square over the queries and over points up to ``LEVER_MM`` from the tracked
+        origin, mm; 0 where nothing can be left out.
+    """
+    times = _increasing(t, "time of pose")
+    # Of a long tracking only the poses about the queries are looked at.
+    near = np.unique(_interval(times, query)[:, None] + np.arange(-1, 3))
+    near = near[(near >= 0) & (near < len(times))]
+    times, poses, squares = times[near], poses[near], np.full(len(near), np.nan)
+    if len(times) < 4:
+        return 0.0
+    for first in (0, 1):
+        kept = slice(first, None, 2)
+        left_out = np.arange(1 + first, len(times) - 1, 2)
+        found = interpolate_poses(times[kept], poses[kept], times[left_out], max_gap_s=np.inf)
+        apart = (found - poses[left_out])[:, :3]
+        # Of the tracked origin, and of a point on each of its axes.
+        apart = apart[..., 3:] + LEVER_MM * np.pad(apart[..., :3], [(0, 0), (0, 0), (1, 0)])
+        squares[left_out] = np.mean(np.sum(apart**2, axis=1), axis=1)
+    before, after = np.diff(times[:-1]), np.diff(times[1:])
+    squares[1:-1][before + after > 2 * max_gap_s] = np.nan
+    # (a / 2)^2
+    squares[1:-1] /= (before * after) ** 2
+    interval = _interval(times, query)
+    ends = np.stack([squares[interval], squares[interval + 1]])
+    known = np.isfinite(ends).any(axis=0)
+    if not known.any():
+        return 0.0
+    since, left = query - times[interval], times[interval + 1] - query
+    return float(np.sqrt(np.mean(np.nanmean(ends[:, known], axis=0) * (since * left)[known] ** 2)))
+
+
 @dataclass(frozen=True)
 class ClockFit:
     """A device's clock in terms of the host's: host = device + offset + drift (device - reference).
@@ -163,17 +215,23 @@ def fit_clock(t_device: np.ndarray, t_host: np.ndarray) -> ClockFit:
         t_host: (n,) host times of arrival, s.
 
     Raises:
-        InputError: fewer than two samples, device times out of order, or values not finite.
+        InputError: fewer than two samples, device times out of order, host times that do not
+            increase with them, values that are not finite or too large for seconds.
     """
     device = _increasing(t_device, "device time")
     host = real_array(t_host, "host times")
     if host.shape != device.shape or not np.isfinite(host).all():
         raise InputError(f"host times must be {len(device)} numbers, one for each device time")
+    for what, values in (("device", device), ("host", host)):
+        if np.spacing(np.abs(values).max()) > _COARSEST_S:
+            raise InputError(f"{what} times of {np.abs(values).max():.3g} are no seconds")
     # Seconds since 1970 have few digits left for microseconds: count from the first sample.
     reference = float(device[0])
     x, y = device - reference, host - device
     base = float(y[0])
     drift, level = _lower_envelope(x, y - base)
+    if drift <= -1:
+        raise InputError("host times must increase with the device times")
     return ClockFit(base + level, drift, reference, y - base - level - drift * x)
 
 

@@ -10,7 +10,9 @@ of a millisecond. Where a corrected fit is far better, the slip is reported.
 f the sum of squares as given and f' the corrected one, the likelihood ratio is
 (f / f')^((3 n - p) / 2). It must exceed ``ODDS``, so that chance is ruled out although some twenty
 slips are tried. And f must exceed ``FACTOR`` times f', so that imperfect but correct data are not
-reported.
+reported. If the images fit badly, poses and points are also shifted by up to half the
+recording, as where they were stamped by two clocks; for these shifts f must exceed ``FARTHER``
+times f'.
 
 What no fit can detect: points that are mirrored (u or v counted from the other side), or swapped
 where both axes have the same or an unknown scale. Eq. 7 knows the image's lateral and axial
@@ -24,6 +26,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 
@@ -58,6 +61,16 @@ PIXELS_MM = (0.002, 3.0)
 SAME_SCALE = 1.25
 """With a slip corrected, known scales must come out within this factor."""
 
+FARTHER = 16.0
+"""The same factor for lists that are several rows out of step: many shifts are tried, and in slow
+motion some wrong one is near to the poses by chance."""
+
+FEWEST_IN_STEP = 20
+"""Fewest images that a shift by several rows must leave, besides half of them."""
+
+EVERY_SHIFT = 200
+"""Every shift by up to so many rows is tried, and half as many larger ones in geometric steps."""
+
 UNFIT, UNFIT_MM = 0.5, 5.0
 """Images do not fit together if their median error exceeds both this share of the target's motion
 and this length. Even a third of wrong images does not raise the median so far."""
@@ -79,41 +92,42 @@ def wrong_frames(problem: Problem, estimate: tuple[str, ...] = ()) -> str | None
         images, _ = image_data(problem, () if known else ("scale",))
     except InputError:
         return None
-    rows = np.unique(np.linspace(0, len(images.points) - 1, MOST_IMAGES).astype(int))
-    count = len(rows)
+    images = replace(images, face_offset=0.0)
+    given = _out_of_step(images, 0)
+    count = len(given.points)
     if 3 * count <= UNKNOWNS:
         return None
-    given = replace(
-        images,
-        rotations=images.rotations[rows],
-        translations=images.translations[rows],
-        points=images.points[rows],
-        face_offset=0.0,
-    )
     fit = _free_fit(given)
     if fit is None or fit.squares <= 0:
         return None
     before = fit.squares
-    best, told = before, None
-    for words, changed in _slips(given):
-        other = _free_fit(replace(given, **changed))
+    apart, extent = _typical_error(given, fit)
+    corrected = [(words, replace(given, **changed), FACTOR) for words, changed in _slips(given)]
+    best, told, least = before, None, FACTOR
+    for words, data, factor in chain(corrected, _steps(images, farther=apart > UNFIT_MM / 2)):
+        other = _free_fit(data)
         if other is None:
             continue
         squares = other.squares * count / other.reduced.images
         if squares < best and _credible(other.scales, images, known):
-            best, told = squares, words
-    if told is not None and _far_better(before, best, count):
+            best, told, least = squares, words, factor
+    if told is not None and _far_better(before, best, count, least):
         return _sentence(told, before, best, count)
     if known and not {"scale", "sound-speed"} & set(estimate):
         told = _wrong_scale(given, fit)
         if told is not None:
             return told
-    apart, extent = _typical_error(given, fit)
     if 3 * count > 2 * UNKNOWNS and apart > max(UNFIT_MM, UNFIT * extent):
         return (
             f"the images do not fit together (typical error {apart:.2g} mm, of a target that moves "
-            f"by {extent:.2g} mm in them): do poses and points belong together, and in which "
-            "frames and conventions are the poses?"
+            f"by {extent:.2g} mm in them): do poses and points belong together, with times of one "
+            "clock, and in which frames and conventions are the poses?"
+        )
+    size = fit.scales * given.spacing
+    if not known and size.max() > PIXELS_MM[1]:
+        return (
+            f"the pixels come out as {size[0]:.3g} x {size[1]:.3g} mm: are the poses' translations "
+            "in mm?"
         )
     return None
 
@@ -156,9 +170,9 @@ def _typical_error(data: ImageData, fit: _Fit) -> tuple[float, float]:
     return float(np.median(np.linalg.norm(cloud - target, axis=1))), extent
 
 
-def _far_better(before: float, after: float, count: int) -> bool:
+def _far_better(before: float, after: float, count: int, factor: float = FACTOR) -> bool:
     gained = 0.5 * (3 * count - UNKNOWNS) * np.log(before / after)
-    return bool(before > FACTOR * after and gained > np.log(ODDS))
+    return bool(before > factor * after and gained > np.log(ODDS))
 
 
 def _credible(scales: Float[np.ndarray, " 2"], images: ImageData, known: bool) -> bool:
@@ -211,21 +225,38 @@ def _slips(data: ImageData) -> Iterator[tuple[str, dict[str, np.ndarray]]]:
             f"the columns {name} of the poses' translations are exchanged: put them in order",
             {"translations": shifts[:, order]},
         )
-    if len(data.points) > 5:
-        all_but_last, all_but_first = slice(None, -1), slice(1, None)
-        for words, poses, points in (
-            ("before", all_but_last, all_but_first),
-            ("after", all_but_first, all_but_last),
-        ):
-            yield (
-                f"each point belongs to the pose of the row {words}: the two lists are one row out "
-                "of step",
-                {
-                    "rotations": rotations[poses],
-                    "translations": shifts[poses],
-                    "points": data.points[points],
-                },
+
+
+def _steps(data: ImageData, farther: bool) -> Iterator[tuple[str, ImageData, float]]:
+    """Poses and points out of step by one row, or ``farther``: words, data and factor."""
+    count = len(data.points)
+    if count <= 5:
+        return
+    most = max(1, min(count // 2, count - FEWEST_IN_STEP)) if farther else 1
+    near = min(most, EVERY_SHIFT)
+    shifts = np.r_[1 : near + 1, np.geomspace(near, most, EVERY_SHIFT // 2)].astype(int)
+    for by in np.unique(shifts).tolist():
+        for words, rows_after in (("before", -by), ("after", by)):
+            told = (
+                f"the pose of the row {words}: the two lists are one row out of step, or one lags"
+                if by == 1
+                else f"the pose about {by} rows {words}: are both stamped by one clock? (else "
+                "import with --lag)"
             )
+            factor = FACTOR if by == 1 else FARTHER
+            yield f"each point belongs to {told}", _out_of_step(data, rows_after), factor
+
+
+def _out_of_step(data: ImageData, by: int) -> ImageData:
+    """Points with the poses ``by`` rows after them, as many as are checked."""
+    rows = np.arange(max(0, -by), len(data.points) - max(0, by))
+    rows = rows[np.unique(np.linspace(0, len(rows) - 1, MOST_IMAGES).astype(int))]
+    return replace(
+        data,
+        rotations=data.rotations[rows + by],
+        translations=data.translations[rows + by],
+        points=data.points[rows],
+    )
 
 
 def _wrong_scale(data: ImageData, fit: _Fit) -> str | None:

@@ -36,11 +36,14 @@ class Imported(NamedTuple):
         recording: of the files.
         notes: what was assumed, left out and counted, in words.
         frames: what became of every frame, where the target was looked for in them.
+        most_lost: whether fewer than half of the frames, or of the points of another file, are in
+            the recording.
     """
 
     recording: Recording
     notes: list[str]
     frames: FrameResults | None = None
+    most_lost: bool = False
 
 
 def import_files(
@@ -112,21 +115,28 @@ def _naming_pose_units(options: ImportOptions, stated: bool = False) -> Iterator
 
 
 def _good_time(
-    time: Float[np.ndarray, " n"], place: Callable[[int], str], options: ImportOptions
+    time: Float[np.ndarray, " n"],
+    place: Callable[[int], str],
+    options: ImportOptions,
+    by_time: bool = False,
 ) -> tuple[Float[np.ndarray, " n"] | None, list[str]]:
     """The times, unless they repeat or go back, which mostly are two recordings in one; and notes.
 
-    ``place`` says where a row stands.
+    ``place`` says where a row stands, ``by_time`` whether poses were looked up by these times.
     """
     back = np.flatnonzero(np.diff(time) <= 0)
     if not len(back):
         return time, []
     if not options.ignore_time:
+        row = int(back[0]) + 1
+        guess = "too few digits, or " * bool(time[row] == time[row - 1])
+        then = "imports images with poses at such times" if by_time else "imports without times"
         raise InputError(
-            f"{place(int(back[0]) + 1)}: the time stamp is not later than the one before: two "
-            "recordings in one? (--ignore-time imports without times)"
+            f"{place(row)}: the time stamp is not later than the one before: {guess}two recordings "
+            f"in one? (--ignore-time {then})"
         )
-    return None, ["time stamps repeat or go back: not kept"]
+    wrong = ", but poses are those at these times: if times are wrong, poses are, too" * by_time
+    return None, [f"time stamps repeat or go back: not kept{wrong}"]
 
 
 def _from_sequence(
@@ -160,16 +170,19 @@ def _from_sequence(
                 _search(sequence, valid, options) if results is None else results.of_tracked(valid)
             )
             used = _found_points(sequence, results, options.minimum)
+            given, what = len(sequence), "frames"
         else:
             where += f" with {os.fspath(points)}"
             notes += placed.notes + _mirrored(sequence, points)
             used = _usable_points(sequence, placed, valid)
+            given, what = len(placed.rows), "points"
         time, said = None, []
         if np.isfinite(sequence.time[used.rows]).all():
             time, said = _good_time(
                 sequence.time[used.rows],
                 lambda row: f"{sequence.source}: {sequence.frame_name(int(used.rows[row]))}",
                 options,
+                by_time=tracking is not None,
             )
         pixels = sequence.pixels
         size = None if pixels is None else (pixels.columns, pixels.rows)
@@ -186,10 +199,13 @@ def _from_sequence(
             where=where,
         )
     notes += used.notes + said
+    most_lost = len(used.rows) < given / 2
+    if most_lost:
+        notes.insert(0, f"only {len(used.rows)} of {given} {what} can be used: see below")
     # A table of poses does not name their frames.
     named = options.poses is None or kind_of(options.poses) != "table"
     recording = Recording(images, source=sequence.source, pose_frames=frames if named else None)
-    return Imported(recording, notes, results)
+    return Imported(recording, notes, results, most_lost)
 
 
 def _estimated_lag(

@@ -24,6 +24,7 @@ from jaxcal.io.sequence_header import (
 )
 from jaxcal.runtime.messages import quoted
 
+_AS_ONE = ": only pixels that follow the header are read (save both as one file, .nrrd)"
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 _NRRD_TYPES = {
     "u1": ("uchar", "unsigned char", "uint8", "uint8_t"),
@@ -59,12 +60,10 @@ def read_nrrd(path: Path, name: str) -> TrackedSequence:
             raise FormatError(f"line {line} is not a field: {quoted(text)}")
     fields = header.fields
     if not header.end:
-        raise FormatError(
-            "its pixels are in another file (no empty line ends the header): not read"
-        )
+        raise FormatError(f"its pixels are in another file{_AS_ONE}")
     for key in ("data file", "datafile", "line skip", "lineskip", "byte skip", "byteskip"):
         if key in fields:
-            raise FormatError(f"has {quoted(key)}: only pixels that follow the header are read")
+            raise FormatError(f"has {quoted(key)}{_AS_ONE}")
     columns, rows, channels, count = _nrrd_size(fields)
     check_count(count, header)
     pixels = None

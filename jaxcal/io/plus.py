@@ -322,7 +322,7 @@ def _check_other_paths(others: list[Element], wanted: FramePair) -> None:
         )
         raise FormatError(
             f"{wanted[0]} and {wanted[1]} are connected already, by {steps}; PLUS refuses a second "
-            "path"
+            "path: take one of these out"
         )
 
 

@@ -12,6 +12,7 @@ from jaxcal.data.timing import (
     can_interpolate,
     estimate_latency,
     interpolate_poses,
+    interpolation_error,
     motion_along_main_axis,
 )
 from jaxcal.io.sequence import TrackedSequence
@@ -26,6 +27,8 @@ _SHORT = 0.02
 _SHARED = 0.2
 """Largest share of poses with the time stamp of another: it is that of stamps which are rounded to
 1.25 intervals between poses."""
+_TOLD_MM = 0.5
+"""Larger errors of interpolation are told; the noise of a tracker looks like smaller ones."""
 _ROUNDED_S = 1e-6
 """Times that were written as text and read again may be off by so much."""
 
@@ -92,6 +95,13 @@ def with_poses_by_time(
     found = np.full((len(images), 4, 4), np.nan)
     found[between] = interpolate_poses(time, poses, asked[between], max_gap_s=gap, valid=valid)
     notes = [f"poses of {source} at the images' times" + (f" less {lag_s:g} s" if lag_s else "")]
+    cost = interpolation_error(time[valid], poses[valid], asked[between], max_gap_s=gap)
+    if cost > _TOLD_MM:
+        notes.append(
+            f"poses are {interval:.3g} s apart, and the probe moves between them: interpolated "
+            f"poses are wrong by about {cost:.1f} mm (RMS, from leaving poses out); record poses "
+            "more often, or hold the probe still for each image"
+        )
     lost = int((~between).sum())
     if lost:
         notes.append(

@@ -103,7 +103,7 @@ _NOT_IMPORTED = {
         (".bag", ".mcap", ".db3"),
         " (save its poses as a table, CSV, and its images as PNG in a folder)",
     ),
-    ".mrb": "",
+    **dict.fromkeys((".mrml", ".mrb"), " (save its sequence from Slicer as .seq.nrrd)"),
     **dict.fromkeys((".mat", ".npy", ".npz", ".xls", ".xlsx", ".ods"), _AS_TABLE),
 }
 """Endings of other files, and what to do with these."""

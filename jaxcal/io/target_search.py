@@ -68,11 +68,6 @@ class FrameResults:
         return {name: int((self.fate == number).sum()) for number, name in enumerate(FATES)}
 
     @property
-    def most_lost(self) -> bool:
-        """Whether more frames were left out, for whatever reason, than the target was found in."""
-        return len(self.found) < len(self) / 2
-
-    @property
     def reasons(self) -> dict[str, int]:
         """Number of frames by the reason for which no target was credible, the commonest first."""
         short = (

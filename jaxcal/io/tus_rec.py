@@ -98,12 +98,17 @@ def read_calib_matrix(
     """What :func:`calib_matrix` was made from; the file is not trusted.
 
     Raises:
-        FormatError: not the ten lines of such a file; file and line are named.
+        FormatError: not such a file; file and line are named. Lines after the first ten, and
+            what follows a heading, are not read.
     """
     with naming(path):
-        found = list(itertools.islice(text_lines(path), 11))
-        if len(found) != 10 or found[0][1].strip() != _SCALING:
-            raise FormatError("is no calib_matrix.csv of TUS-REC: ten lines are needed")
+        found = list(itertools.islice(text_lines(path), 10))
+        titles = [line for _, line in found[::5]]
+        if len(found) != 10 or not all(map(str.startswith, titles, (_SCALING, _CALIBRATION))):
+            raise FormatError(
+                "is no calib_matrix.csv of TUS-REC: its first ten lines are a line that begins "
+                f"with {_SCALING}, four rows, one that begins with {_CALIBRATION}, four rows"
+            )
         scaling, rigid = (_four_rows(found[start : start + 4]) for start in (1, 6))
         if np.abs(scaling - np.diag(np.diag(scaling))).max() > 0 or (np.diag(scaling) <= 0).any():
             raise FormatError("its scaling is not a diagonal of positive numbers")

@@ -254,6 +254,12 @@ def _record(transform: ImageTransform) -> dict[str, Any]:
     }
 
 
+def _check_calibrated(matrix: np.ndarray) -> None:
+    """Refuse the identity, which PLUS and Slicer hold before there is a calibration."""
+    if np.array_equal(matrix, np.eye(4)):
+        raise InputError("the transform is the identity: it was not calibrated yet")
+
+
 def load_calibration(path: str | os.PathLike[str]) -> ImageTransform:
     """Read a calibration; the file is not trusted, and JAX is not needed.
 
@@ -277,12 +283,15 @@ def load_calibration(path: str | os.PathLike[str]) -> ImageTransform:
             from jaxcal.io.plus import read_transform
 
             found = read_transform(path)
+            _check_calibrated(found.matrix)
             made = transform_from_plus_matrix(found.matrix, error_mm=found.error_mm, source=name)
             return replace(made, probe_frame=found.target)
         if lower.endswith((".tfm", ".txt", ".h5")):
             from jaxcal.io.itk import read_itk
 
-            return transform_from_plus_matrix(read_itk(path), source=name)
+            matrix = read_itk(path)
+            _check_calibrated(matrix)
+            return transform_from_plus_matrix(matrix, source=name)
         if lower.endswith(".csv"):
             from jaxcal.io.tus_rec import read_calib_matrix
 

@@ -433,8 +433,8 @@ def transform_from_plus_matrix(
         raise InputError(
             f"{source}: rows and columns of pixels are "
             f"{math.degrees(math.acos(lateral @ axial)):.3f} degrees apart: fCal fitted the matrix "
-            "without a constraint (OptimizationMethod NONE), so that it is no rigid transform and "
-            "pixel size"
+            "without a constraint (OptimizationMethod NONE), or it was rounded, so that it is no "
+            "rigid transform and pixel size"
         )
     # The nearest orthonormal pair, then y = z cross x.
     u, _, vt = np.linalg.svd(np.stack([lateral, axial], axis=1), full_matrices=False)
