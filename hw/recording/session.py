@@ -451,7 +451,7 @@ class Session:
             counts["us"] = self.images.statistics()
         for group, found in counts.items():
             losses = {name: getattr(found, name) for name in _LOSSES if hasattr(found, name)}
-            self._recorder.attributes(group, losses)
+            self._recorder.counts(group, losses)
             text = ", ".join(f"{count} {name}" for name, count in losses.items() if count)
             if text:
                 self._recorder.add_event("losses", f"/{group}: {text}", self.clock.now())

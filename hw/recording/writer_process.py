@@ -116,6 +116,8 @@ def _serve(writer: RecordingWriter, messages: queue.Queue, answer: Callable[...,
                 writer.copy(*message["from"], *message["to"])
             case "attributes":
                 writer.attributes(message["group"], message["values"])
+            case "counts":
+                writer.counts(message["group"], message["values"])
             case "sync":
                 writer.flush(durable=True)
                 due = None
