@@ -288,7 +288,7 @@ class Recorder:
         self._put({"do": "attributes", "group": group, "values": dict(values)})
 
     def counts(self, group: str, values: Mapping[str, int]) -> None:
-        """Set attributes of a group that count something in this run; a resumed one adds to them."""
+        """Set attributes of a group that count something in this run; runs add up."""
         self._put({"do": "counts", "group": group, "values": dict(values)})
 
     def sync(self) -> None:

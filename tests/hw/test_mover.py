@@ -90,7 +90,9 @@ def test_a_stop_by_a_signal_is_kept_at_whatever_moment_it_comes(step):
         if step == "release":
             latch.set(SILENCE)
 
-        def trace(frame: FrameType, event: str, value: object) -> Callable:
+        def trace(
+            frame: FrameType, event: str, value: object, latch: StopLatch = latch
+        ) -> Callable:
             nonlocal left
             frame.f_trace_opcodes = True
             if event == "opcode":
