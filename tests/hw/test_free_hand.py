@@ -481,6 +481,16 @@ def test_no_image_has_the_pose_of_an_earlier_place_after_its_clock_was_set_back(
     assert all(each.pose is not None for each in posed[:40])
 
 
+def test_images_and_poses_of_clocks_that_differ_are_put_together_as_they_arrive():
+    """Below 60 s, each image had the pose of an earlier place, without a word."""
+    with sending(lambda kind, t: 100.0 + t - (1.2 if kind == "IMAGE" else 0.0)) as images:
+        assert images.by_arrival
+        posed = [images.read(60.0) for _ in range(30)]
+    off = [abs(each.pose[0, 3] - 0.02 * k) for k, each in enumerate(posed) if each.pose is not None]
+    assert len(off) > 25
+    assert np.median(off) < 0.1
+
+
 def test_time_stamps_in_another_unit_are_not_used():
     """They let an image be taken of a probe that was held still for a thousandth of the time."""
     with sending(lambda kind, t: 1000.0 * (100.0 + t)) as images:
