@@ -19,9 +19,9 @@ def monotonic_s() -> float:
     """Seconds of the clock that all readings of :class:`Clock` come from.
 
     It is monotonic, and one clock for all processes of a machine. On Linux NTP changes the rate of
-    ``time.monotonic`` by up to 500 ppm, more than :class:`Lag` takes for the drift of two clocks;
-    the rate of CLOCK_MONOTONIC_RAW is never changed. Windows lacks it, but does not change the rate
-    of ``time.monotonic`` either.
+    ``time.monotonic``, by 500 ppm or more while it corrects the time: more than :class:`Lag` takes
+    for the drift of two clocks. The rate of CLOCK_MONOTONIC_RAW is never changed. Windows lacks it,
+    but does not change the rate of ``time.monotonic`` either.
     """
     return time.monotonic() if _RAW is None else time.clock_gettime(_RAW)
 
