@@ -200,8 +200,9 @@ class RecordingWriter:
         """Set attributes that count something since the file was opened: over all runs together."""
         attributes = self._file.require_group(name).attrs
         for key, count in values.items():
-            before = self._counted.setdefault((name, key), int(attributes.get(key, 0)))
-            attributes[key] = before + count
+            held = attributes.get(key)
+            known = int(held) if isinstance(held, np.integer) else 0
+            attributes[key] = self._counted.setdefault((name, key), known) + count
 
     def flush(self, *, durable: bool = False) -> None:
         """Bring the file on the disk up to date; ``durable``: also past the system's cache.
