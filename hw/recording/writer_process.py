@@ -45,7 +45,7 @@ def main(path: str) -> int:
             answers.flush()
 
     # Objects of a file that cannot be written would print errors on the screen when they end.
-    sys.unraisablehook = lambda _: None
+    sys.unraisablehook = sys.excepthook = lambda *_: None
     writer = None
     try:
         messages: queue.Queue[tuple[dict, dict] | None] = queue.Queue(_MOST_WAITING)

@@ -49,7 +49,7 @@ from hw.robot.confirmation import confirm_unattended
 from hw.robot.motion import Motion
 from hw.robot.motion_plan import MotionPlan
 from hw.robot.path_checks import check_plan
-from hw.runtime.errors import LostError, RefusedError
+from hw.runtime.errors import LostError, RefusedError, StoppedError
 from hw.runtime.keys import Pause
 from hw.setup.check import check
 from hw.setup.description import Setup
@@ -533,6 +533,23 @@ def test_what_ends_a_run_is_recorded_whatever_it_is(e_series, tmp_path):
     with h5py.File(path) as file:
         assert file["events/kind"][-1] == b"stopped"
         assert file["events/text"][-1] == b"BrokenPipeError: [Errno 32] Broken pipe"
+
+
+def test_a_disk_that_fails_as_well_does_not_hide_why_the_robot_was_stopped(e_series, tmp_path):
+    path = tmp_path / "rec.h5"
+
+    def say(line: str) -> None:
+        if line.startswith("confirmed: "):
+            (writer,) = (
+                int(process.name)
+                for process in Path("/proc").glob("[0-9]*")
+                if os.fsencode(path) in (process / "cmdline").read_bytes().split(b"\0")
+            )
+            resource.prlimit(writer, resource.RLIMIT_FSIZE, (1000, 1000))
+            raise StoppedError("protective stop", device="robot")
+
+    ended = first_end(e_series, path, say, AcquisitionStopped)
+    assert re.match(r"robot: protective stop; .*: cannot be written: .*; 0 of 4 images", str(ended))
 
 
 def test_an_interrupt_while_the_end_is_noted_does_not_hide_it(e_series, tmp_path):

@@ -335,6 +335,18 @@ def test_a_disk_that_does_not_answer_or_is_full_is_one_line(tmp_path):
     RecordingWriter.resume(tmp_path / "nearly.h5").close()
 
 
+def test_a_disk_that_takes_nothing_any_more_is_one_line(tmp_path, capfd):
+    """Also not in place of what is there, as where files are copied on write."""
+    recorder, recording = Recorder(tmp_path / "full.h5", HEADER), simulated()
+    take(recorder, recording, 0)
+    resource.prlimit(recorder._process.pid, resource.RLIMIT_FSIZE, (1000, 1000))
+    with pytest.raises(jaxcal.OutputError, match="cannot be written"):
+        take(recorder, recording, 1)
+    with pytest.raises(jaxcal.OutputError):
+        recorder.close()
+    assert capfd.readouterr().err == ""
+
+
 def test_a_writer_that_takes_no_data_does_not_hold_the_end_up(tmp_path, monkeypatch):
     """As where a disk hangs: closing waited without end, deaf to Ctrl-C, and said nothing."""
     path, recording = tmp_path / "rec.h5", simulated()
