@@ -152,7 +152,7 @@ def acquire(
     say(f"plan: {job.images} poses{pool}, {job.to_take} to go; compiling the estimate")
     estimator.warm_up(job.targets[: job.images])
     recorder = open_recorder(path, job)
-    reason, interrupted, by_itself = "interrupted", False, False
+    reason, interrupted, by_itself, by_device = "interrupted", False, False, False
     failure: Exception | None = None
 
     def note_end() -> None:
@@ -178,6 +178,7 @@ def acquire(
                     # A stream that hesitated or a watchdog that tripped: a person would only try
                     # again.
                     by_itself = isinstance(error, StaleError | LostError)
+                    by_device = isinstance(error, DeviceError)
                 except Exception as error:
                     # Standard error is gone, or a fault of this program: for the caller to report.
                     reason, failure = f"{type(error).__name__}: {error}", error
@@ -195,8 +196,9 @@ def acquire(
     if failure is not None:
         raise failure
     if recorder.error is not None and not interrupted:
-        # The recorder's failure is the cause of what went wrong.
-        reason = str(recorder.error)
+        # Its failure is the cause of what went wrong, or hid from the file what else did.
+        told = str(recorder.error)
+        reason = f"{reason}; {told}" if by_device and told not in reason else told
     then = "to go on" if interrupted else "correct this, then"
     raise AcquisitionStopped(
         reason,

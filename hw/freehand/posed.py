@@ -3,8 +3,9 @@
 Transforms come under their names (``ProbeToTracker``), with the image (PlusServer's TRACKEDFRAME)
 or by themselves (TRANSFORM, TDATA), before the image or after it. The pose of an image is the one
 with the same time stamp, or is interpolated between the two around it. Time stamps are the
-sender's; PlusServer gives them to images and transforms alike. Where stamps are missing, or of
-images and transforms over 60 s apart, times of arrival are used, and the person is told.
+sender's; PlusServer gives them to images and transforms alike. Where stamps are missing, or those
+of images and transforms are of clocks that differ by over 1 s, times of arrival are used, and the
+person is told.
 """
 
 from __future__ import annotations
@@ -36,7 +37,8 @@ _LATEST_S = 0.4
 """How long an image waits for the pose after it, beyond a negative lag."""
 _SAME_S = 1e-6
 _KEPT = 1024
-_ONE_CLOCK_S = 60.0
+_ONE_CLOCK_S = 1.0
+"""Images come later than the poses of their time, but not by so much (assumption)."""
 _SET_S = 0.3
 """Neither delays nor the drift of two clocks change the time between them by so much."""
 _SECONDS = 20.0
@@ -116,12 +118,16 @@ class PosedImages:
                 device="tracker",
             )
         self._needed = [list(pairs)[index] for index, _ in self._steps]
-        stamps = [self._waiting[0][0].t_device]
-        stamps += [self._samples[name][0].t_device for name in self._needed]
-        apart = np.ptp(stamps) if np.isfinite(stamps).all() else np.inf
+        # By how much a stamp is ahead of the arrival of what was quickest.
+        images = np.max([image.t_device - image.t_host for image, _ in self._waiting])
+        poses = [
+            np.max([sample.t_device - sample.t_host for sample in self._samples[name]])
+            for name in self._needed
+        ]
+        one_clock = bool(np.max(np.abs(images - poses)) <= _ONE_CLOCK_S)
         came = np.ptp([(image.t_device, image.t_host) for image, _ in self._waiting], axis=0)
         in_seconds = came[1] < _MORE_S / 2 or 1 / _SECONDS < came[0] / came[1] < _SECONDS
-        self.by_arrival = bool(apart > _ONE_CLOCK_S or not in_seconds)
+        self.by_arrival = not (one_clock and in_seconds)
         first = self._waiting[0][0]
         self._ahead = {
             name: _ahead(first, first.t_host, self._samples[name][0]) for name in self._needed

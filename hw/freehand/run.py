@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import ClassVar
@@ -15,6 +14,7 @@ from hw.freehand.request import FreeHand, FreeHandStopped, Person
 from hw.recording.check import opened, read_column
 from hw.recording.file import RecordingWriter
 from hw.recording.recorder import Recorder
+from hw.runtime.clock import REAL
 from hw.runtime.errors import DeviceError
 from jaxcal import CalibrationError, InputError
 from jaxcal.data.recording import MINIMUM_IMAGES, MetresError, check_pose_units
@@ -139,7 +139,7 @@ class Run(ABC):
 
     def note(self, kind: str, text: str) -> None:
         """Say a line, and put it among the recording's events."""
-        self._recorder.add_event(kind, text, time.monotonic())
+        self._recorder.add_event(kind, text, REAL.now())
         self._person.say(f"{kind}: {text}")
 
 

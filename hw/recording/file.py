@@ -75,6 +75,8 @@ class RecordingWriter:
         # A duplicate of HDF5's descriptor: it leads to the same file whatever becomes of the path.
         self._descriptor = os.dup(file.id.get_vfd_handle())
         self._allocated = self._pending = 0
+        self._counted: dict[tuple[str, str], int] = {}
+        """What was counted in earlier runs."""
         self._make_room(0)
         members = {name: _columns(file, name) for name in LAYOUT}
         self.rows = {
@@ -193,6 +195,14 @@ class RecordingWriter:
         """Set attributes of a group of the layout."""
         for key, value in values.items():
             self._file.require_group(name).attrs[key] = _plain(value)
+
+    def counts(self, name: str, values: Mapping[str, int]) -> None:
+        """Set attributes that count something since the file was opened: over all runs together."""
+        attributes = self._file.require_group(name).attrs
+        for key, count in values.items():
+            held = attributes.get(key)
+            known = int(held) if isinstance(held, np.integer) else 0
+            attributes[key] = self._counted.setdefault((name, key), known) + count
 
     def flush(self, *, durable: bool = False) -> None:
         """Bring the file on the disk up to date; ``durable``: also past the system's cache.

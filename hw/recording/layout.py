@@ -10,7 +10,8 @@ A superset of the smallest valid recording (:mod:`jaxcal.io.hdf5`): once ``compl
     /us          t_host t_device [s], frame_id, frames (N,H,W)
     /ae          t_host [s], frame_id, clock_ticks, tof_ticks (N,lines), amplitude (N,lines),
                  threshold
-                 attrs of /us and /ae: frames lost, damaged (crc_errors), ...: of the last run
+                 attrs of /us and /ae: frames lost, damaged (crc_errors), ..., in all
+                 runs that were not killed
     /events      t_host [s], utc, kind, text
     /clock       device, offset, drift, reference, residual: t_host = t_device + offset
                  + drift (t_device - reference) [s]; t_host of the fit

@@ -287,6 +287,10 @@ class Recorder:
         """Set attributes of a group."""
         self._put({"do": "attributes", "group": group, "values": dict(values)})
 
+    def counts(self, group: str, values: Mapping[str, int]) -> None:
+        """Set attributes of a group that count something in this run; runs add up."""
+        self._put({"do": "counts", "group": group, "values": dict(values)})
+
     def sync(self) -> None:
         """Wait until everything handed over so far is on the disk.
 
@@ -331,7 +335,7 @@ class Recorder:
 
     def _note_drops(self) -> None:
         for group, count in self.dropped.items():
-            self._put({"do": "attributes", "group": group, "values": {"dropped": count}})
+            self.counts(group, {"dropped": count})
 
     def _stream(self, group: str, columns: Mapping[str, np.ndarray]) -> None:
         """Continuous rows: dropped and counted where there is no room."""

@@ -376,9 +376,11 @@ class Session:
                 self._first_seen[digest] = first
                 if len(self._first_seen) > _KEPT_FRAMES:
                     del self._first_seen[next(iter(self._first_seen))]
-            if poses and (self._rest is None or apart(self._rest.pose, poses[-1].pose) > _MOVED_MM):
-                self._moved_s = -math.inf if self._rest is None else poses[-1].t_host
-                self._rest = poses[-1]
+            if poses and self._moved(poses[-1]):
+                # Of those that came together, the newest may be from long after the arrival.
+                for pose in filter(self._moved, poses):
+                    self._moved_s = -math.inf if self._rest is None else pose.t_host
+                    self._rest = pose
             self._changed.notify_all()
         hz = self._clock_hz
         self._stamp("robot", [(pose.t_device, pose.t_host) for pose in poses[-1:]])
@@ -390,6 +392,9 @@ class Session:
             self._recorder.add_images(images)
         if time.monotonic() - self._handed_over > _BATCH_WALL_S:
             self._hand_over()
+
+    def _moved(self, pose: PoseSample) -> bool:
+        return self._rest is None or apart(self._rest.pose, pose.pose) > _MOVED_MM
 
     def _of_one_device(self, images: list[Image]) -> list[Image]:
         """Those that are shown and recorded: of the first device, RF only where nothing else is.
@@ -451,7 +456,7 @@ class Session:
             counts["us"] = self.images.statistics()
         for group, found in counts.items():
             losses = {name: getattr(found, name) for name in _LOSSES if hasattr(found, name)}
-            self._recorder.attributes(group, losses)
+            self._recorder.counts(group, losses)
             text = ", ".join(f"{count} {name}" for name, count in losses.items() if count)
             if text:
                 self._recorder.add_event("losses", f"/{group}: {text}", self.clock.now())

@@ -45,7 +45,7 @@ def main(path: str) -> int:
             answers.flush()
 
     # Objects of a file that cannot be written would print errors on the screen when they end.
-    sys.unraisablehook = lambda _: None
+    sys.unraisablehook = sys.excepthook = lambda *_: None
     writer = None
     try:
         messages: queue.Queue[tuple[dict, dict] | None] = queue.Queue(_MOST_WAITING)
@@ -116,6 +116,8 @@ def _serve(writer: RecordingWriter, messages: queue.Queue, answer: Callable[...,
                 writer.copy(*message["from"], *message["to"])
             case "attributes":
                 writer.attributes(message["group"], message["values"])
+            case "counts":
+                writer.counts(message["group"], message["values"])
             case "sync":
                 writer.flush(durable=True)
                 due = None

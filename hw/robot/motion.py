@@ -199,6 +199,9 @@ class Motion:
             LostError: the connection is gone; motion needs a new confirmation.
         """
         with self._one_at_a_time:
+            if self._in_motion:
+                # An interrupt ended the last motion, and another one what was done about that.
+                self.stop("interrupted")
             self.check()
             asked = np.asarray(pose).tolist()
             self._count += 1
@@ -226,8 +229,8 @@ class Motion:
         """Stop after an interrupt or a failed guard, before its exception goes on."""
         try:
             self.stop("interrupted")
-        finally:
             self._in_motion = False
+        finally:
             self._wait_for_end()
 
     def _wait_for_end(self) -> None:

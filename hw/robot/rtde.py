@@ -22,6 +22,7 @@ from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from hw.runtime.clock import monotonic_s
 from hw.runtime.errors import LostError, refused
 
 PORT = 30004
@@ -170,7 +171,7 @@ class Packet:
     """One packet of the controller, as it came."""
 
     monotonic_s: float
-    """``time.monotonic()`` at its arrival."""
+    """Reading of :func:`hw.runtime.clock.monotonic_s` at its arrival."""
     timestamp_s: float
     tcp_pose: tuple[float, ...]
     """Tool centre point in the base frame: m and rotation vector (rad)."""
@@ -279,7 +280,7 @@ class PacketReader:
             data = None
         except OSError as error:
             raise LostError(f"the connection broke: {error}", device="robot") from error
-        now = time.monotonic()
+        now = monotonic_s()
         if data:
             self._data += data
         payloads, self._kept = self._kept, []
@@ -368,7 +369,7 @@ class PacketReader:
             self._places[name] = start if end == start + 1 else slice(start, end)
             start = end
         self.bound, self.latency_s = self._begin(deadline)
-        """``bound``: a moment of ``time.monotonic()`` and a time of the controller (s): the packet
+        """``bound``: a reading of ``monotonic_s()`` and a time of the controller (s): the packet
         with this time stamp was not made before that moment. ``latency_s``: an upper bound of how
         long the fastest packet was on its way (wall s). See :meth:`_begin`."""
 
@@ -397,7 +398,7 @@ class PacketReader:
                 # Packets sent before the answer to this request to pause are read and dropped.
                 self._ask(b"P", b"", deadline)
                 self._kept.clear()
-            asked = time.monotonic()
+            asked = monotonic_s()
             if self._ask(b"S", b"", deadline)[:1] != b"\x01":
                 raise refused("the controller would not start sending")
             try:
@@ -405,7 +406,7 @@ class PacketReader:
             except TimeoutError:
                 # The controller accepts but sends nothing: whoever reads will notice.
                 break
-            packet = self._packet(time.monotonic(), self._kept[0])
+            packet = self._packet(monotonic_s(), self._kept[0])
             stamp = packet.timestamp_s
             above = min(above, packet.monotonic_s - stamp)
             bounds.append((asked - period, stamp))

@@ -15,18 +15,31 @@ _MOST_DRIFT = 200e-6
 _MOST_AHEAD_S = 0.1
 
 
+def monotonic_s() -> float:
+    """Seconds of the clock that all readings of :class:`Clock` come from.
+
+    It is monotonic, and one clock for all processes of a machine. On Linux NTP changes the rate of
+    ``time.monotonic``, by 500 ppm or more while it corrects the time: more than :class:`Lag` takes
+    for the drift of two clocks. The rate of CLOCK_MONOTONIC_RAW is never changed. Windows lacks it,
+    but does not change the rate of ``time.monotonic`` either.
+    """
+    return time.monotonic() if _RAW is None else time.clock_gettime(_RAW)
+
+
+_RAW = getattr(time, "CLOCK_MONOTONIC_RAW", None)
+
+
 @dataclass(frozen=True)
 class Clock:
     """A monotonic clock that starts at zero.
 
-    ``time.monotonic`` is one clock for all processes of a machine, so a child process that is
-    handed ``speed`` and ``origin_s`` reads the same bench time.
+    A child process that is handed ``speed`` and ``origin_s`` reads the same bench time.
     """
 
     speed: float = 1.0
     """Bench seconds per second on the wall."""
-    origin_s: float = field(default_factory=time.monotonic)
-    """``time.monotonic()`` at bench time zero."""
+    origin_s: float = field(default_factory=monotonic_s)
+    """Reading of :func:`monotonic_s` at bench time zero."""
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.speed) and self.speed > 0):
@@ -36,11 +49,11 @@ class Clock:
 
     def now(self) -> float:
         """Bench time (s)."""
-        return (time.monotonic() - self.origin_s) * self.speed
+        return (monotonic_s() - self.origin_s) * self.speed
 
-    def at(self, monotonic_s: float) -> float:
-        """Bench time (s) of a reading of ``time.monotonic()``."""
-        return (monotonic_s - self.origin_s) * self.speed
+    def at(self, reading_s: float) -> float:
+        """Bench time (s) of a reading of :func:`monotonic_s`."""
+        return (reading_s - self.origin_s) * self.speed
 
     def wall(self, seconds: float) -> float:
         """Wall seconds that a number of bench seconds takes."""

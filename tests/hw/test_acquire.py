@@ -49,7 +49,7 @@ from hw.robot.confirmation import confirm_unattended
 from hw.robot.motion import Motion
 from hw.robot.motion_plan import MotionPlan
 from hw.robot.path_checks import check_plan
-from hw.runtime.errors import LostError, RefusedError
+from hw.runtime.errors import LostError, RefusedError, StoppedError
 from hw.runtime.keys import Pause
 from hw.setup.check import check
 from hw.setup.description import Setup
@@ -506,6 +506,20 @@ def test_a_fault_of_any_device_stops_the_robot_and_the_run_is_resumed(e_series, 
             assert main(["calibrate", str(path)]) == 2
 
 
+def first_end(
+    bench: Bench, path: Path, say: Callable[[str], None], kind: type[Exception]
+) -> Exception:
+    """How a run ended that a busy machine has not ended before."""
+    request: AcquisitionRequest | None = AcquisitionRequest(4, "none", 1, bench=3)
+    for _ in range(ATTEMPTS):
+        with pytest.raises((AcquisitionStopped, kind)) as ended:
+            run(bench, path, request, say, setup=quick_setup_of(bench))
+        if not (isinstance(ended.value, AcquisitionStopped) and ended.value.by_itself):
+            return ended.value
+        request = None
+    raise AssertionError("the bench cannot keep up with itself")
+
+
 def test_what_ends_a_run_is_recorded_whatever_it_is(e_series, tmp_path):
     """As where the pipe that standard error leads to is closed: nobody else can tell later."""
     path = tmp_path / "rec.h5"
@@ -514,12 +528,28 @@ def test_what_ends_a_run_is_recorded_whatever_it_is(e_series, tmp_path):
         if line.startswith("confirmed: "):
             raise BrokenPipeError(errno.EPIPE, "Broken pipe")
 
-    request = AcquisitionRequest(4, "none", 1, bench=3)
-    with pytest.raises(BrokenPipeError):
-        run(e_series, path, request, say, setup=quick_setup_of(e_series))
+    ended = first_end(e_series, path, say, BrokenPipeError)
+    assert isinstance(ended, BrokenPipeError)
     with h5py.File(path) as file:
         assert file["events/kind"][-1] == b"stopped"
         assert file["events/text"][-1] == b"BrokenPipeError: [Errno 32] Broken pipe"
+
+
+def test_a_disk_that_fails_as_well_does_not_hide_why_the_robot_was_stopped(e_series, tmp_path):
+    path = tmp_path / "rec.h5"
+
+    def say(line: str) -> None:
+        if line.startswith("confirmed: "):
+            (writer,) = (
+                int(process.name)
+                for process in Path("/proc").glob("[0-9]*")
+                if os.fsencode(path) in (process / "cmdline").read_bytes().split(b"\0")
+            )
+            resource.prlimit(writer, resource.RLIMIT_FSIZE, (1000, 1000))
+            raise StoppedError("protective stop", device="robot")
+
+    ended = first_end(e_series, path, say, AcquisitionStopped)
+    assert re.match(r"robot: protective stop; .*: cannot be written: .*; 0 of 4 images", str(ended))
 
 
 def test_an_interrupt_while_the_end_is_noted_does_not_hide_it(e_series, tmp_path):
@@ -535,9 +565,8 @@ def test_an_interrupt_while_the_end_is_noted_does_not_hide_it(e_series, tmp_path
         if line.startswith("confirmed: "):
             raise Lost("gone", device="robot")
 
-    request = AcquisitionRequest(4, "none", 1, bench=3)
-    with pytest.raises(AcquisitionStopped, match="interrupted; 0 of 4"):
-        run(e_series, path, request, say, setup=quick_setup_of(e_series))
+    ended = first_end(e_series, path, say, AcquisitionStopped)
+    assert "interrupted; 0 of 4" in str(ended)
     with h5py.File(path) as file:
         assert file["events/kind"][-1] == b"stopped"
         assert file["events/text"][-1] == b"interrupted"

@@ -14,17 +14,17 @@ import pytest
 from packaging.requirements import Requirement
 
 from hw.runtime import extras
-from hw.runtime.clock import REAL, Clock
+from hw.runtime.clock import REAL, Clock, monotonic_s
 from hw.runtime.errors import DeviceError, LostError, RefusedError, StaleError, StoppedError
 from hw.runtime.extras import missing, require
 
 
 def test_bench_time_runs_at_its_speed():
     clock = Clock(speed=50.0)
-    start_wall, start = time.monotonic(), clock.now()
+    start_wall, start = monotonic_s(), clock.now()
     clock.sleep(2.0)
     passed = clock.now() - start
-    wall = time.monotonic() - start_wall
+    wall = monotonic_s() - start_wall
     assert wall >= 2.0 / 50.0
     assert 2.0 <= passed <= 50.0 * wall
     assert clock.wall(5.0) == pytest.approx(0.1)
@@ -34,10 +34,18 @@ def test_bench_time_runs_at_its_speed():
 def test_a_clock_starts_at_zero_and_is_shared_by_its_origin():
     clock = Clock(speed=3.0)
     twin = Clock(speed=clock.speed, origin_s=clock.origin_s)
-    reading = time.monotonic()
+    reading = monotonic_s()
     assert clock.at(reading) == twin.at(reading) == pytest.approx((reading - clock.origin_s) * 3)
     assert clock.at(clock.origin_s) == 0.0
     assert REAL.speed == 1.0
+
+
+@pytest.mark.skipif(not hasattr(time, "CLOCK_MONOTONIC_RAW"), reason="there is no such clock here")
+def test_ntp_does_not_change_the_rate_of_a_clock():
+    """A slew of 500 ppm (adjtimex) would make every pose look 0.1 s old after six minutes."""
+    before = time.clock_gettime(time.CLOCK_MONOTONIC_RAW)
+    now, arrival = Clock(origin_s=0.0).now(), monotonic_s()
+    assert before <= now <= arrival <= time.clock_gettime(time.CLOCK_MONOTONIC_RAW)
 
 
 @pytest.mark.parametrize("speed", [0.0, -1.0, float("nan"), float("inf")])

@@ -219,6 +219,18 @@ def test_poses_that_are_frozen_with_new_stamps_end_motion(robots):
     put_in_order(robot)
 
 
+def test_nobody_is_told_that_an_arm_moves_whose_poses_are_frozen(robots):
+    """Those of a moving arm, so speed included: it had come to rest long before."""
+    robot = robots["CB"]
+    put_in_order(robot)
+    with moving(robot, caller_s=2.0) as motion:
+        error, *_ = fault_in_motion(robot, motion, partial(robot.ask, "freeze", True))
+        with pytest.raises(StoppedError, match="frozen: press the emergency stop if it moves"):
+            raise error
+        assert "still moves" not in str(error)
+    put_in_order(robot)
+
+
 def test_lost_answers_end_motion_though_poses_come(robots):
     """ur_rtde would tell 2.5 s later, and a command would wait until then."""
     robot = robots["CB"]

@@ -14,6 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, suppress
 from dataclasses import asdict, replace
 from pathlib import Path
+from types import FrameType
 
 import numpy as np
 import pytest
@@ -325,3 +326,31 @@ def test_a_log_that_fails_stops_the_robot():
         state = robot.state()
     assert state["rest_since"] - times[0] <= STOP_WITHIN_S
     assert state["reason"] == "the client stopped the script"
+
+
+def test_an_interrupt_within_what_an_interrupt_did_is_kept():
+    """Ctrl-C twice: the second came before the first had latched its stop."""
+
+    def interrupted() -> None:
+        sys.settrace(interrupt_the_stop)
+        raise KeyboardInterrupt
+
+    def interrupt_the_stop(frame: FrameType, event: str, value: object) -> None:
+        if frame.f_code is Motion._stop_and_wait.__code__:
+            # Python stops tracing with it.
+            raise KeyboardInterrupt
+
+    motion = Motion("127.0.0.2", PLAN, None, guard=interrupted)
+    with subprocess.Popen(["cat"], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        motion._process = process
+        with pytest.raises(KeyboardInterrupt):
+            motion.move_to(HOME)
+        motion.guard = None
+        with pytest.raises(RefusedError, match=r"motion has ended \(interrupted\)"):
+            motion.move_to(HOME)
+        assert motion.ended
+        assert process.stdin is not None
+        process.stdin.close()
+        assert process.stdout is not None
+        requests = [json.loads(line)["request"] for line in process.stdout]
+        assert requests == ["stop"]

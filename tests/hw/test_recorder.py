@@ -109,6 +109,20 @@ def test_an_event_may_name_a_path_that_is_not_utf_8(tmp_path):
         assert file["events/text"][0] == rb"r\udcff.h5: the disk is nearly full"
 
 
+def test_counts_of_the_runs_of_a_recording_add_up(tmp_path):
+    path = tmp_path / "r.h5"
+    for header, lost, dropped in ((HEADER, 3, 2), (None, 4, 5)):
+        with Recorder(path, header) as recorder:
+            recorder.counts("us", {"lost": 1})
+            recorder.counts("us", {"lost": lost})
+            recorder.dropped["us"] = dropped
+            recorder.sync()
+    with h5py.File(path) as file:
+        assert {name: file["us"].attrs[name] for name in ("lost", "dropped")} == {
+            "lost": 7, "dropped": 7,
+        }  # fmt: skip
+
+
 def test_signals_that_end_all_processes_leave_the_writer_to_the_acquisition(tmp_path):
     """At a system's shutdown: why the run has ended must still be written."""
     path = tmp_path / "rec.h5"
@@ -319,6 +333,18 @@ def test_a_disk_that_does_not_answer_or_is_full_is_one_line(tmp_path):
     with pytest.raises(jaxcal.OutputError, match="nearly full"):
         writer.flush()
     RecordingWriter.resume(tmp_path / "nearly.h5").close()
+
+
+def test_a_disk_that_takes_nothing_any_more_is_one_line(tmp_path, capfd):
+    """Also not in place of what is there, as where files are copied on write."""
+    recorder, recording = Recorder(tmp_path / "full.h5", HEADER), simulated()
+    take(recorder, recording, 0)
+    resource.prlimit(recorder._process.pid, resource.RLIMIT_FSIZE, (1000, 1000))
+    with pytest.raises(jaxcal.OutputError, match="cannot be written"):
+        take(recorder, recording, 1)
+    with pytest.raises(jaxcal.OutputError):
+        recorder.close()
+    assert capfd.readouterr().err == ""
 
 
 def test_a_writer_that_takes_no_data_does_not_hold_the_end_up(tmp_path, monkeypatch):

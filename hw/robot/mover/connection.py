@@ -141,7 +141,9 @@ class Connection:
         self._controller.local = True
 
     def close(self) -> None:
-        """Stop, end the script in order (its watchdog must not trip), then disconnect.
+        """Stop, and end the script in order: its watchdog must not trip.
+
+        The connection ends with this process: ur_rtde would take half a second to disconnect.
 
         Raises:
             Ended: the robot does not stop, or is lost.
@@ -150,8 +152,6 @@ class Connection:
         self._controller.brake()
         if self._controller.usable():
             self.end_script()
-            self._controller.log("disconnect")
-            self._controller.rtde_control.disconnect()
         self.end_paused()
 
     def end_script(self) -> None:

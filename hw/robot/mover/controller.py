@@ -176,6 +176,7 @@ class Controller:
             Ended: the robot does not stop, or is lost.
         """
         give_up = self._clock.now() + self._clock.patience(STOP_PATIENCE_S)
+        before = self._inputs.packet.tcp_pose
         while self.usable():
             # Asynchronous: a call that waits for rest would hold the watchdog's kicks back, and
             # braking may take longer than the watchdog waits. The poses show what stopL did.
@@ -184,6 +185,11 @@ class Controller:
                 return
             if self._clock.now() > give_up:
                 text = "the robot was told to stop and still moves: press the emergency stop"
+                if self._inputs.packet.tcp_pose == before:
+                    text = (
+                        "the robot was told to stop, but nothing shows that it rests, since the "
+                        "reported pose is frozen: press the emergency stop if it moves"
+                    )
                 raise Ended(LostError(text, device="robot"))
 
     def _rests(self) -> bool:

@@ -35,20 +35,31 @@ class Ended(Exception):
 
 
 class StopLatch:
-    """Keeps the first stop; a stop for good replaces a hesitation."""
+    """Keeps the first stop; a stop for good replaces a hesitation.
+
+    The handler of a signal may set one for good between any two instructions of another call, so
+    nothing that is done about a hesitation touches what such a stop sets.
+    """
 
     def __init__(self) -> None:
-        self.stop: Stop | None = None
+        self._hesitation: Stop | None = None
+        self._for_good: Stop | None = None
+
+    @property
+    def stop(self) -> Stop | None:
+        """The stop that is latched."""
+        return self._for_good or self._hesitation
 
     def set(self, stop: Stop) -> None:
         """Latch a stop."""
-        if self.stop is None or (stop.for_good and not self.stop.for_good):
-            self.stop = stop
+        if stop.for_good:
+            self._for_good = self._for_good or stop
+        else:
+            self._hesitation = self._hesitation or stop
 
     def release(self) -> None:
         """Forget a hesitation, once the robot rests; a stop for good is never released."""
-        assert self.stop is None or not self.stop.for_good
-        self.stop = None
+        self._hesitation = None
 
 
 class Inputs:

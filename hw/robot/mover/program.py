@@ -49,7 +49,6 @@ def guarded_program(module: Any, host: str, watchdog_hz: float) -> bytes:
             text = (said(error) if isinstance(error, RuntimeError) else str(error)).encode()
         with open(write, "wb") as out:
             out.write(text)
-        # To return would call ur_rtde's destructor, which takes half a second.
         os._exit(0)
     os.close(write)
     with open(read, "rb") as source:
@@ -73,7 +72,9 @@ def _text_of(module: Any, host: str) -> bytes:
         source.sendall(b"request_program\n")
         while not text.endswith(_LAST_LINE) and (data := source.recv(1 << 16)):
             text += data
-    assert connected is not None
+    # Its destructor disconnects and waits for half a second: the controller may need a moment to
+    # free the input registers, which the next connection uses.
+    del connected
     return text
 
 
