@@ -179,12 +179,18 @@ from hw.acquisition.live_calibration import LiveCalibration
 from jaxcal import backend
 from jaxcal.study import run_study
 from jaxcal.study.spec import parse_spec
+class Unknown:  # as pandas' NA
+    def __eq__(self, other):
+        return self
+    def __bool__(self):
+        raise TypeError
 START = 'name = "a"\nseed = 1\ntrials = 1\n[[methods]]\nname = "a"\nmethod = "alternating"\n'
 warnings.simplefilter("error")
 draws = np.random.default_rng(0)
 poses = np.tile(np.eye(4), (9, 1, 1))
 poses[:, :3, 3] = draws.uniform(-50, 50, (9, 3))
 points = draws.uniform(10, 50, (9, 2))
+images = jaxcal.make_images(poses, points)
 problem = jaxcal.Problem.from_arrays(poses, points)
 result = jaxcal.calibrate(problem, "conventional")
 probe = jaxcal.LinearProbe(elements=16)
@@ -351,6 +357,15 @@ for call, *given in (
     *((lambda mask, data=data: jaxcal.calibrate_closed_form(
         dataclasses.replace(data, mask=mask)), mask)
       for data, mask in ((problem, np.ones(5)), (jaxcal.stack([problem]), np.ones((1, 5))))),
+    (lambda mask: jaxcal.Problem.from_arrays(poses, points, mask=mask), [True] * 8 + [Unknown()]),
+    *((lambda value, name=name: dataclasses.replace(problem, **{name: value}), value)
+      for name, value in (("mask", keep), ("measurements", np.ma.array(points, mask=points > 40)))),
+    (jaxcal.make_images, poses, [np.ma.array(row, mask=row > 40) for row in points]),
+    (jaxcal.make_images, poses, [*points[:8].tolist(), [1.0, np.ma.masked]]),
+    *((lambda value, name=name: dataclasses.replace(images, **{name: value}), value)
+      for name, value in (("mask", keep), ("mask", [True] * 9), ("kind", "points"))),
+    *((lambda values: jaxcal.calibrate(dataclasses.replace(problem, poses=values), "conventional"),
+       values) for values in (poses.swapaxes(1, 2), -poses, poses * np.array([-1.0, 1, 1, 1]))),
 ):
     try:
         call(*given)
@@ -362,7 +377,7 @@ for call, *given in (
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stderr == ""
     lines = done.stdout.splitlines()
-    assert len(lines) == 207
+    assert len(lines) == 218
     assert lines[0].startswith("jaxcal.calibrate takes a problem, not a path: ")
     assert lines[3].startswith("jaxcal.calibrate_batch takes a problem or a recording, not int: ")
     assert lines[4] == "points must have shape (..., 2), not (1, 3)"
@@ -394,6 +409,11 @@ for call, *given in (
     for line in lines[90:100]:
         assert line.startswith("the name of a file must be text or a pathlib.Path, not ")
     assert not Path("no-such-folder").exists()
+    assert lines[207] == "mask must be an array of booleans (True = used)"
+    for line in lines[208:213]:
+        assert line.endswith(" must not hold masked entries: leave those rows out (mask=)")
+    assert lines[213] == "mask must be a numpy array, not a list"
+    assert lines[217].startswith("pose 0 is a reflection")
     assert lines[69] == "robust must be True or False, not 'no'"
 
 
