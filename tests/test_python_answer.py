@@ -360,6 +360,7 @@ for call, *given in (
     (lambda mask: jaxcal.Problem.from_arrays(poses, points, mask=mask), [True] * 8 + [Unknown()]),
     *((lambda value, name=name: dataclasses.replace(problem, **{name: value}), value)
       for name, value in (("mask", keep), ("measurements", np.ma.array(points, mask=points > 40)))),
+    (jaxcal.calibrate_pivot, poses, np.full(9, 0.5)), (jaxcal.calibrate_pivot, poses, -np.ones(9)),
     (jaxcal.make_images, poses, [np.ma.array(row, mask=row > 40) for row in points]),
     (jaxcal.make_images, poses, [*points[:8].tolist(), [1.0, np.ma.masked]]),
     *((lambda value, name=name: dataclasses.replace(images, **{name: value}), value)
@@ -377,7 +378,7 @@ for call, *given in (
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stderr == ""
     lines = done.stdout.splitlines()
-    assert len(lines) == 218
+    assert len(lines) == 220
     assert lines[0].startswith("jaxcal.calibrate takes a problem, not a path: ")
     assert lines[3].startswith("jaxcal.calibrate_batch takes a problem or a recording, not int: ")
     assert lines[4] == "points must have shape (..., 2), not (1, 3)"
@@ -409,11 +410,12 @@ for call, *given in (
     for line in lines[90:100]:
         assert line.startswith("the name of a file must be text or a pathlib.Path, not ")
     assert not Path("no-such-folder").exists()
-    assert lines[207] == "mask must be an array of booleans (True = used)"
-    for line in lines[208:213]:
+    assert lines[207] == "mask must hold booleans (True = used)"
+    for line in [*lines[208:210], *lines[212:215]]:
         assert line.endswith(" must not hold masked entries: leave those rows out (mask=)")
-    assert lines[213] == "mask must be a numpy array, not a list"
-    assert lines[217].startswith("pose 0 is a reflection")
+    assert lines[210] == lines[211] == lines[207]
+    assert lines[215] == "mask must be a numpy array, not a list"
+    assert lines[219].startswith("pose 0 is a reflection")
     assert lines[69] == "robust must be True or False, not 'no'"
 
 

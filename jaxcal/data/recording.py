@@ -18,7 +18,7 @@ from jaxcal.data.poses import check_poses
 from jaxcal.data.probe import Probe, check_probe
 from jaxcal.runtime.array_types import Bool, Float, Int
 from jaxcal.runtime.arrays import is_traced
-from jaxcal.runtime.given_values import is_number, real_array, refuse_masked
+from jaxcal.runtime.given_values import is_number, real_array, refuse_masked, truth_array
 from jaxcal.runtime.messages import counted, shown
 
 MINIMUM_IMAGES = 4
@@ -549,16 +549,10 @@ def _check_magnitude(name: str, values: np.ndarray, used: np.ndarray) -> None:
 def _mask(mask: np.ndarray | None, count: int) -> Bool[np.ndarray, " n"]:
     if mask is None:
         return np.ones(count, bool)
-    try:
-        mask = np.ma.filled(mask, False)  # a masked entry is left out
-        known = mask.dtype == bool or np.isin(mask, (0, 1)).all()
-    except (TypeError, ValueError):  # lists of several lengths, or pandas' NA
-        raise InputError("mask must be an array of booleans (True = used)") from None
+    mask = truth_array(mask, "mask")
     if mask.shape != (count,):
         raise InputError(f"mask must have shape ({count},), it has {mask.shape}")
-    if not known:
-        raise InputError("mask must hold booleans (True = used)")
-    return mask.astype(bool)
+    return mask
 
 
 def _per_image(

@@ -45,6 +45,21 @@ def refuse_masked(value: Any, name: str) -> None:
             refuse_masked(each, name)
 
 
+def truth_array(value: Any, name: str) -> np.ndarray:
+    """A caller's mask as an array of booleans; a masked entry is False.
+
+    Raises:
+        InputError: other values than truth values, 0 and 1.
+    """
+    try:
+        given = np.ma.filled(value, False)
+        if given.dtype == bool or np.isin(given, (0, 1)).all():
+            return given.astype(bool)
+    except (TypeError, ValueError):  # lists of several lengths, or pandas' NA
+        pass
+    raise InputError(f"{name} must hold booleans (True = used)")
+
+
 def is_number(value: Any) -> bool:
     """Whether a caller's value is one finite real number, not a text, truth value or array."""
     try:
