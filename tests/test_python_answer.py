@@ -79,7 +79,10 @@ def test_batches_and_traces_print_without_a_verdict(recording):
         batch.verdict()
     seen = []
     jax.jit(lambda p: seen.append(str(jaxcal.calibrate(p, "conventional"))))(problem)
-    assert seen[0].startswith("Calibration(")
+    shapes = jax.eval_shape(lambda each: each, batch[0])
+    for other in (seen[0], str(shapes), str(jax.tree.map(np.shape, batch[0]))):
+        assert other.startswith("Calibration(")
+    assert shapes._repr_html_() is None
 
 
 def test_intervals_are_refused_in_words_where_they_are_traced(result):
