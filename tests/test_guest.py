@@ -20,6 +20,7 @@ from golden import corpus
 
 import jaxcal
 from jaxcal import Options
+from jaxcal.runtime.jax_modes import in_own_modes
 
 DOCS = Path(__file__).parents[1] / "docs"
 
@@ -136,6 +137,35 @@ STRICT = {
     "jax_numpy_rank_promotion": ("allow", "raise"),
     "jax_debug_nans": (False, True),
 }
+
+
+def test_an_interrupt_leaves_the_modes_of_the_caller():
+    """Ctrl-C may arrive before any line; JAX's own lines are its own matter."""
+    guest, before = in_own_modes(lambda: None), sys.gettrace()
+    left = 0
+
+    def interrupt(frame, event, _):
+        nonlocal left
+        if event == "line" and f"{os.sep}jax{os.sep}" not in frame.f_code.co_filename:
+            left -= 1
+            if left < 0:
+                raise KeyboardInterrupt
+        return interrupt
+
+    with jax.enable_x64(False):
+        guest()
+        for first in range(10_000):
+            left = first
+            sys.settrace(interrupt)
+            try:
+                guest()
+                break
+            except KeyboardInterrupt:
+                pass
+            finally:
+                sys.settrace(before)
+            assert not jax.config.jax_enable_x64, first
+    assert first > 20
 
 
 @pytest.fixture

@@ -79,7 +79,10 @@ def test_batches_and_traces_print_without_a_verdict(recording):
         batch.verdict()
     seen = []
     jax.jit(lambda p: seen.append(str(jaxcal.calibrate(p, "conventional"))))(problem)
-    assert seen[0].startswith("Calibration(")
+    shapes = jax.eval_shape(lambda each: each, batch[0])
+    for other in (seen[0], str(shapes), str(jax.tree.map(np.shape, batch[0]))):
+        assert other.startswith("Calibration(")
+    assert shapes._repr_html_() is None
 
 
 def test_intervals_are_refused_in_words_where_they_are_traced(result):
@@ -179,13 +182,19 @@ from hw.acquisition.live_calibration import LiveCalibration
 from jaxcal import backend
 from jaxcal.study import run_study
 from jaxcal.study.spec import parse_spec
+class Unknown:  # as pandas' NA
+    def __eq__(self, other):
+        return self
+    def __bool__(self):
+        raise TypeError
 START = 'name = "a"\nseed = 1\ntrials = 1\n[[methods]]\nname = "a"\nmethod = "alternating"\n'
 warnings.simplefilter("error")
 draws = np.random.default_rng(0)
 poses = np.tile(np.eye(4), (9, 1, 1))
 poses[:, :3, 3] = draws.uniform(-50, 50, (9, 3))
 points = draws.uniform(10, 50, (9, 2))
-problem = jaxcal.Problem.from_arrays(poses, points)
+images = jaxcal.make_images(poses, points)
+problem = jaxcal.Problem.from_arrays(poses, points, dtype=">f8")
 result = jaxcal.calibrate(problem, "conventional")
 probe = jaxcal.LinearProbe(elements=16)
 raw = jaxcal.make_images(poses, np.full((9, 16), 2e-5), "time_of_flight")
@@ -351,6 +360,16 @@ for call, *given in (
     *((lambda mask, data=data: jaxcal.calibrate_closed_form(
         dataclasses.replace(data, mask=mask)), mask)
       for data, mask in ((problem, np.ones(5)), (jaxcal.stack([problem]), np.ones((1, 5))))),
+    (lambda mask: jaxcal.Problem.from_arrays(poses, points, mask=mask), [True] * 8 + [Unknown()]),
+    *((lambda value, name=name: dataclasses.replace(problem, **{name: value}), value)
+      for name, value in (("mask", keep), ("measurements", np.ma.array(points, mask=points > 40)))),
+    (jaxcal.calibrate_pivot, poses, np.full(9, 0.5)), (jaxcal.calibrate_pivot, poses, -np.ones(9)),
+    (jaxcal.make_images, poses, [np.ma.array(row, mask=row > 40) for row in points]),
+    (jaxcal.make_images, poses, [*points[:8].tolist(), [1.0, np.ma.masked]]),
+    *((lambda value, name=name: dataclasses.replace(images, **{name: value}), value)
+      for name, value in (("mask", keep), ("mask", [True] * 9), ("kind", "points"))),
+    *((lambda values: jaxcal.calibrate(dataclasses.replace(problem, poses=values), "conventional"),
+       values) for values in (poses.swapaxes(1, 2), -poses, poses * np.array([-1.0, 1, 1, 1]))),
 ):
     try:
         call(*given)
@@ -362,7 +381,7 @@ for call, *given in (
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stderr == ""
     lines = done.stdout.splitlines()
-    assert len(lines) == 207
+    assert len(lines) == 220
     assert lines[0].startswith("jaxcal.calibrate takes a problem, not a path: ")
     assert lines[3].startswith("jaxcal.calibrate_batch takes a problem or a recording, not int: ")
     assert lines[4] == "points must have shape (..., 2), not (1, 3)"
@@ -394,6 +413,12 @@ for call, *given in (
     for line in lines[90:100]:
         assert line.startswith("the name of a file must be text or a pathlib.Path, not ")
     assert not Path("no-such-folder").exists()
+    assert lines[207] == "mask must hold booleans (True = used)"
+    for line in [*lines[208:210], *lines[212:215]]:
+        assert line.endswith(" must not hold masked entries: leave those rows out (mask=)")
+    assert lines[210] == lines[211] == lines[207]
+    assert lines[215] == "mask must be a numpy array, not a list"
+    assert lines[219].startswith("pose 0 is a reflection")
     assert lines[69] == "robust must be True or False, not 'no'"
 
 

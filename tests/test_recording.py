@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import jaxcal
-from jaxcal import InputError
+from jaxcal import InputError, design
 
 
 def arrays() -> dict:
@@ -55,8 +55,10 @@ def test_recordings_can_be_compared_and_kept_in_sets():
     assert recording != other
     assert recording.calibration != other.calibration
     assert len({recording, other, recording}) == 2
-    transform = jaxcal.ImageTransform(np.eye(4))
-    assert transform != copy.deepcopy(transform)
+    candidates = design.make_candidates(count=12)
+    for found in (jaxcal.ImageTransform(np.eye(4)), candidates, candidates.model):
+        assert found != copy.deepcopy(found)
+        assert len({found, found}) == 1
 
 
 TRACED = """

@@ -33,7 +33,7 @@ from jaxcal.model.thresholds import FEWEST_IMAGES
 from jaxcal.result.calibration import Status, check_one
 from jaxcal.runtime import compiler, executables
 from jaxcal.runtime.arrays import first_images, is_traced
-from jaxcal.runtime.given_values import check_flag, real_array
+from jaxcal.runtime.given_values import check_flag, real_array, truth_array
 from jaxcal.runtime.jax_modes import in_own_modes, inside_transformation, require_float64
 from jaxcal.solvers import dense
 from jaxcal.solvers.consensus import (
@@ -197,7 +197,7 @@ def calibrate_pivot(
     Args:
         poses: tool -> tracker, mm, (n, 4, 4) or (n, 3, 4); concrete ones are checked and their
             rotations projected to SO(3). Leading axes make a batch, which is solved as it is.
-        mask: 1 (or True) for poses to use; all by default. Of concrete poses, not of a batch, those
+        mask: True (or 1) for poses to use; all by default. Of concrete poses, not of a batch, those
             that repeat an earlier one exactly are not used.
         robust: find the poses that agree with each other, even if nearly half of all poses are
             wrong, and leave the others out.
@@ -213,12 +213,10 @@ def calibrate_pivot(
     shape = np.shape(poses)
     if len(shape) < 3 or shape[-2:] not in ((4, 4), (3, 4)):
         raise InputError(f"poses must have shape (n, 4, 4), not {shape}")
-    if isinstance(mask, np.ma.MaskedArray):
-        mask = mask.filled(0)  # a masked entry is left out
+    if mask is not None and not is_traced(mask):
+        mask = truth_array(mask, "mask")
     if mask is not None and np.shape(mask) not in (shape[:-2], shape[-3:-2]):
         raise InputError(f"mask must have shape {shape[:-2]}, not {np.shape(mask)}")
-    if not (mask is None or is_traced(mask) or np.asarray(mask).dtype == bool):
-        mask = real_array(mask, "mask")
     if not is_traced(poses) and np.ndim(poses) == 3:
         used = np.ones(len(poses), bool) if mask is None else np.asarray(mask) > 0
         poses = check_poses(real_array(poses, "poses"), used)

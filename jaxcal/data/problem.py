@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from jaxcal import InputError
+from jaxcal.data.poses import check_poses
 from jaxcal.data.probe import CurvilinearProbe
 from jaxcal.data.recording import (
     MINIMUM_IMAGES,
@@ -37,6 +38,7 @@ from jaxcal.runtime.arrays import (
     map_arrays,
     static,
 )
+from jaxcal.runtime.given_values import refuse_masked
 from jaxcal.runtime.jax_modes import importing_jax, in_own_modes
 from jaxcal.runtime.messages import counted, shown
 
@@ -49,6 +51,7 @@ _HOW = (
 def _make_floating(tree: Channels | Problem) -> None:
     """Booleans and whole numbers become floats: a mask given to dataclasses.replace, say."""
     for name, value in vars(tree).items():
+        refuse_masked(value, name)
         if getattr(getattr(value, "dtype", None), "kind", "") in ("b", "i", "u"):
             object.__setattr__(tree, name, value.astype(float))
 
@@ -281,7 +284,7 @@ def _floating(dtype: DTypeLike | None) -> np.dtype:
     # bfloat16 and its like are of numpy's kind V; JAX has nothing longer than 64 bits.
     if found.kind not in "fV" or found.itemsize > 8:
         raise InputError(f"dtype must be a floating one, e.g. numpy.float32, not {shown(dtype)}")
-    return found
+    return found.newbyteorder("=")
 
 
 def taken(problem: Problem, rows: list[int]) -> Problem:
@@ -449,9 +452,9 @@ def check_values(problem: Problem) -> None:
     """Refuse NaN, Inf and too few images, if the values are concrete.
 
     Raises:
-        InputError: a mask of other numbers than 0 and 1, NaN or Inf, or what is no covariance or
-            no bound, with the number of the image; too few images; no size of pixels, no sound
-            speed.
+        InputError: a mask of other numbers than 0 and 1, NaN or Inf, or what is no pose, no
+            covariance or no bound, with the number of the image; too few images; no size of pixels,
+            no sound speed.
     """
     if is_traced(problem):
         return
@@ -462,11 +465,10 @@ def check_values(problem: Problem) -> None:
     if used.sum() < MINIMUM_IMAGES:
         few = counted(int(used.sum()), "used image", "is", "are")
         raise InputError(f"{few} too few: at least {MINIMUM_IMAGES} are needed")
-    for name in ("poses", "measurements"):
-        values = np.asarray(getattr(problem, name))
-        bad = ~np.isfinite(values).reshape(len(used), -1).all(axis=1) & used
-        if bad.any():
-            raise InputError(f"{name} of image {np.flatnonzero(bad)[0]} hold NaN or Inf")
+    check_poses(np.asarray(problem.poses), used)
+    bad = ~np.isfinite(np.asarray(problem.measurements)).all(axis=1) & used
+    if bad.any():
+        raise InputError(f"measurements of image {np.flatnonzero(bad)[0]} hold NaN or Inf")
     spacing = np.asarray(problem.spacing)
     if not (np.isfinite(spacing).all() and (spacing > 0).all()):
         raise InputError(f"spacing of the problem must be two positive numbers, not {spacing}")

@@ -18,7 +18,7 @@ from jaxcal.data.poses import check_poses
 from jaxcal.data.probe import Probe, check_probe
 from jaxcal.runtime.array_types import Bool, Float, Int
 from jaxcal.runtime.arrays import is_traced
-from jaxcal.runtime.given_values import is_number, real_array
+from jaxcal.runtime.given_values import is_number, real_array, refuse_masked, truth_array
 from jaxcal.runtime.messages import counted, shown
 
 MINIMUM_IMAGES = 4
@@ -94,6 +94,14 @@ class Images:
     time_of_flight: Float[np.ndarray, "n elements"] | None = None
     frame: Int[np.ndarray, " n"] | None = None
     frame_size: tuple[int, int] | None = None
+
+    def __post_init__(self) -> None:
+        # make_images has checked everything; dataclasses.replace checks nothing.
+        check_kind(self.kind)
+        for name, value in vars(self).items():
+            refuse_masked(value, name)
+            if isinstance(value, list):
+                raise InputError(f"{name} must be a numpy array, not a list")
 
     def __len__(self) -> int:
         return len(self.poses)
@@ -541,15 +549,10 @@ def _check_magnitude(name: str, values: np.ndarray, used: np.ndarray) -> None:
 def _mask(mask: np.ndarray | None, count: int) -> Bool[np.ndarray, " n"]:
     if mask is None:
         return np.ones(count, bool)
-    try:
-        mask = np.ma.filled(mask, False)  # a masked entry is left out
-    except ValueError:
-        raise InputError("mask must be an array of booleans (True = used)") from None
+    mask = truth_array(mask, "mask")
     if mask.shape != (count,):
         raise InputError(f"mask must have shape ({count},), it has {mask.shape}")
-    if mask.dtype != bool and not np.isin(mask, (0, 1)).all():
-        raise InputError("mask must hold booleans (True = used)")
-    return mask.astype(bool)
+    return mask
 
 
 def _per_image(

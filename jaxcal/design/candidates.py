@@ -46,7 +46,7 @@ _NEAR_MM = 10.0
 """A mount or a target known by eye may be wrong by this much; poses in metres are farther off."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Candidates:
     """Poses to choose from.
 

@@ -135,7 +135,7 @@ class Region:
         return self.place(np.stack([first.ravel(), second.ravel()], axis=-1))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Constraints:
     """Constraints on a pose.
 

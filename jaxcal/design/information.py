@@ -38,7 +38,7 @@ _HALVINGS = 22
 """So often the interval of the factor's logarithm is halved, which gives it to 1e-6."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Known:
     """The information before a plan.
 
@@ -53,7 +53,7 @@ class Known:
     tuned: bool = False
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Model:
     """Everything that the Jacobian of a pose depends on, except the pose.
 

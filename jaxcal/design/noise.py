@@ -41,7 +41,7 @@ def check_result(result: object) -> None:
         raise InputError("poses are planned for one problem; the result is of a batch")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Noise:
     """SDs of lateral position, range and elevational offset by the target's place in the image.
 

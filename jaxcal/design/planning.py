@@ -44,7 +44,7 @@ _SINGULAR = 1e-10
 _TRIED_RAD, _TRIED_SHARE = 0.4, 0.6
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Plan:
     """Chosen poses and their predicted errors.
 

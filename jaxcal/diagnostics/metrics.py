@@ -9,7 +9,7 @@ import numpy as np
 from jaxcal import InputError
 from jaxcal.runtime.array_types import AnyArray, Bool, Float
 from jaxcal.runtime.arrays import array_module, is_traced
-from jaxcal.runtime.given_values import real_array
+from jaxcal.runtime.given_values import real_array, truth_array
 from jaxcal.runtime.jax_modes import traceable
 
 
@@ -26,7 +26,7 @@ def reconstruction_precision(
         image_to_probe: (4, 4) X, mm.
         poses: B_i of the *test* images, probe -> tracker, mm.
         points: (n, 2) [lateral, range], assumed in the plane, or (n, 3) in the image frame, mm.
-        mask: (n,) 1 (or True) for images to count; all by default. The others may hold anything.
+        mask: (n,) True (or 1) for images to count; all by default. The others may hold anything.
 
     Returns:
         sqrt(sum over x, y, z of the unbiased variance (n - 1)), mm.
@@ -38,7 +38,8 @@ def reconstruction_precision(
     xp = array_module(image_to_probe, poses, points, mask)
     image_to_probe = _numbers(image_to_probe, "image_to_probe")
     poses, points = _numbers(poses, "poses"), _numbers(points, "points")
-    mask = None if mask is None else _numbers(mask, "mask")
+    if mask is not None and not is_traced(mask):
+        mask = truth_array(mask, "mask")
     count = len(poses) if poses.ndim else 0
     for name, values, shapes in (
         ("image_to_probe", image_to_probe, [(4, 4)]),
@@ -50,8 +51,6 @@ def reconstruction_precision(
             wanted = " or ".join(map(str, shapes))
             raise InputError(f"{name} must have shape {wanted}, not {np.shape(values)}")
     if mask is not None:
-        if not is_traced(mask) and not np.isin(mask, (0, 1)).all():
-            raise InputError("mask must hold ones (images to count) and zeros")
         poses = xp.where(mask[:, None, None] > 0, poses, 0.0)
         points = xp.where(mask[:, None] > 0, points, 0.0)
     cloud = reconstruct(image_to_probe, poses, points)
@@ -83,11 +82,10 @@ def reconstruct(
 
 
 def _numbers(value: Any, name: str) -> Any:
-    """A caller's array, checked as far as it has values; truth values are 0 and 1."""
+    """A caller's array, checked as far as it has values."""
     if is_traced(value):
         return array_module(value).asarray(value)
-    kind = getattr(getattr(value, "dtype", None), "kind", None)
-    return real_array(np.asarray(value, np.float64) if kind == "b" else value, name)
+    return real_array(value, name)
 
 
 def _transformed(transform: AnyArray, points: AnyArray) -> AnyArray:

@@ -282,7 +282,7 @@ def _precision(result: Calibration, images: Images) -> float | None:
         np.asarray(result.image_to_probe),
         images.poses,
         _points_mm(images, result),
-        images.mask.astype(float),
+        images.mask,
     )
     return float(value)
 

@@ -573,8 +573,8 @@ class Calibration:
         return plots.plot_limits(self)
 
     def __str__(self) -> str:
-        """Table and verdict; for a batch how many converged; if traced, the names of the arrays."""
-        if self.problem is None or is_traced(self):
+        """Table and verdict; for a batch how many converged; without values, the fields."""
+        if not self._has_values():
             return repr(self)
         from jaxcal.report import summary
 
@@ -584,12 +584,16 @@ class Calibration:
 
     def _repr_html_(self) -> str | None:
         """HTML for notebooks; None, so that the text is shown, if there is nothing to draw."""
-        traced = is_traced(self)
-        if self.problem is None or traced or np.ndim(self.mask) != 1:
+        if not self._has_values() or np.ndim(self.mask) != 1:
             return None
         from jaxcal.report.summary import html_of
 
         return html_of(self)
+
+    def _has_values(self) -> bool:
+        """False while traced, and if ``jax.tree.map`` or ``jax.eval_shape`` replaced the arrays."""
+        arrays = hasattr(self.mask, "__array__") and hasattr(self.status_code, "__array__")
+        return self.problem is not None and arrays and not is_traced(self)
 
     def numpy(self) -> Calibration:
         """The same calibration with numpy arrays (concrete values).

@@ -21,8 +21,7 @@ def real_array(value: Any, name: str) -> np.ndarray:
         InputError: what numpy would convert with a loss (complex numbers, masked entries), with a
             guess (texts, truth values) or not at all.
     """
-    if np.ma.is_masked(value):
-        raise InputError(f"{name} must not hold masked entries: leave those rows out (mask=)")
+    refuse_masked(value, name)
     try:
         given = np.asarray(value)
         # bfloat16 and its like are of numpy's kind V.
@@ -32,6 +31,33 @@ def real_array(value: Any, name: str) -> np.ndarray:
     except (TypeError, ValueError, OverflowError):
         pass
     raise InputError(f"{name} must be an array of real numbers")
+
+
+def refuse_masked(value: Any, name: str) -> None:
+    """Raise InputError for masked entries, which numpy's functions would read as if they were not.
+
+    In a list, they are searched for at any depth.
+    """
+    if np.ma.is_masked(value):
+        raise InputError(f"{name} must not hold masked entries: leave those rows out (mask=)")
+    if isinstance(value, list | tuple):
+        for each in value:
+            refuse_masked(each, name)
+
+
+def truth_array(value: Any, name: str) -> np.ndarray:
+    """A caller's mask as an array of booleans; a masked entry is False.
+
+    Raises:
+        InputError: other values than truth values, 0 and 1.
+    """
+    try:
+        given = np.ma.filled(value, False)
+        if given.dtype == bool or np.isin(given, (0, 1)).all():
+            return given.astype(bool)
+    except (TypeError, ValueError):  # lists of several lengths, or pandas' NA
+        pass
+    raise InputError(f"{name} must hold booleans (True = used)")
 
 
 def is_number(value: Any) -> bool:

@@ -22,7 +22,7 @@ from __future__ import annotations
 import importlib
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from functools import wraps
 from typing import Any, ParamSpec, TypeVar
 
@@ -75,14 +75,13 @@ def own_modes(*, bits_too: bool = True) -> Iterator[None]:
     """
     import jax
 
-    with ExitStack() as stack:
-        if bits_too:
-            stack.enter_context(jax.enable_x64(True))
-            stack.enter_context(jax.debug_nans(False))
-            stack.enter_context(jax.debug_infs(False))
-        stack.enter_context(jax.numpy_dtype_promotion("standard"))
-        stack.enter_context(jax.numpy_rank_promotion("allow"))
-        yield
+    # No ExitStack: a Ctrl-C while it works, in Python, would leave the caller in these modes.
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        if not bits_too:
+            yield
+            return
+        with jax.enable_x64(True), jax.debug_nans(False), jax.debug_infs(False):
+            yield
 
 
 def in_own_modes(function: Callable[P, T]) -> Callable[P, T]:

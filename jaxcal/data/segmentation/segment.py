@@ -62,7 +62,7 @@ Fits = DistanceFit | tuple[DistanceFit, DistanceFit]
 """The fit of a linear array, or the in-plane and out-of-plane fits of a curved one."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class OutOfPlane:
     """The elevation from a curved array's distances (Eq. 6), without its sign.
 
@@ -84,7 +84,7 @@ class OutOfPlane:
     determined: Bool[np.ndarray, " n"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Segmentation:
     """Segmented points, and the outcome for every frame.
 
