@@ -16,15 +16,13 @@ import numpy as np
 from jaxcal.diagnostics.image_errors import ImageErrors, Whitened, quadratic
 from jaxcal.diagnostics.intervals import image_jacobian
 from jaxcal.model.image_points import mean_of_squares
+from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.arrays import map_arrays
 from jaxcal.solvers.plan import TUNED
 
 Array = np.ndarray
-
-FEWEST = 8
-"""With fewer images in use the SDs of the errors are not estimated well enough."""
 
 _ROUNDS = 8
 """Rounds of tuning the SDs."""
@@ -76,11 +74,12 @@ def away_from_gaussian(
 
     Returns:
         The distance, and the error of the fit with Gaussian offsets by its own covariance, both
-        root mean squares over the points; None for other answers and with few images.
+        root mean squares over the points; None for other answers, and with fewer
+        images than SDs are tuned for.
     """
     images = int(np.sum(np.asarray(answer.mask) > 0))
     limited = answer.prior in ("bounded", "uniform") and answer.data == "points"
-    if answer.problem is None or not limited or images < FEWEST:
+    if answer.problem is None or not limited or images < MINIMUM_SELF_TUNING:
         return None
     fit = GaussianOffsets.of(map_arrays(lambda leaf: np.asarray(leaf)[None], answer))
     # Every kind gives a third of the unknowns' degrees of freedom.
