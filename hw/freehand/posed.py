@@ -118,21 +118,12 @@ class PosedImages:
                 device="tracker",
             )
         self._needed = [list(pairs)[index] for index, _ in self._steps]
-        # By how much a stamp is ahead of the arrival of what was quickest.
-        images = np.max([image.t_device - image.t_host for image, _ in self._waiting])
-        poses = [
-            np.max([sample.t_device - sample.t_host for sample in self._samples[name]])
-            for name in self._needed
-        ]
-        one_clock = bool(np.max(np.abs(images - poses)) <= _ONE_CLOCK_S)
+        self._ahead = {name: self._ahead_of(name) for name in self._needed}
+        """By how much the images' clock was ahead of that of a transform."""
+        one_clock = bool(np.abs(list(self._ahead.values())).max() <= _ONE_CLOCK_S)
         came = np.ptp([(image.t_device, image.t_host) for image, _ in self._waiting], axis=0)
         in_seconds = came[1] < _MORE_S / 2 or 1 / _SECONDS < came[0] / came[1] < _SECONDS
         self.by_arrival = not (one_clock and in_seconds)
-        first = self._waiting[0][0]
-        self._ahead = {
-            name: _ahead(first, first.t_host, self._samples[name][0]) for name in self._needed
-        }
-        """By how much the images' clock was ahead of that of a transform."""
 
     @property
     def behind(self) -> int:
@@ -242,6 +233,20 @@ class PosedImages:
                 )[0]
             before = sample
         return f"{name} began after this image"
+
+    def _ahead_of(self, name: str) -> float:
+        """By how much the images' clock is ahead of the transform's, by the quickest of each, s.
+
+        Only of what came at the same time: a queue may have dropped the first images.
+        """
+        images = [image for image, _ in self._waiting]
+        samples = self._samples[name]
+        meanwhile = [s for s in samples if images[0].t_host <= s.t_host <= images[-1].t_host]
+        image, sample = (
+            np.max([each.t_device - each.t_host for each in came])
+            for came in (images, meanwhile or samples)
+        )
+        return float(image - sample)
 
     def _was_set(self, name: str, image: Image, sample: Transform) -> bool:
         """Whether the clocks of image and transform differ by another time than at the start."""

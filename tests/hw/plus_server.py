@@ -68,13 +68,18 @@ def frame(rng: np.random.Generator, pixel: np.ndarray | None) -> np.ndarray:
     return np.clip(255 * (decibels + 20) / 60, 0, 255).astype(np.uint8)
 
 
+seen = 0
+"""The count of the pose whose frames the person has seen last."""
+
+
 def stream(asked: dict):
     """(stamp, frame, transforms) for ever: hold, travel, hold, ...
 
     Args:
         asked: ``poses``: how many there are; ``seed``; ``first``: the pose to begin at; ``order``:
             poses in the order in which they are held; ``lost``: poses at which the probe is out of
-            view; ``hidden``: poses at which nothing is in the image.
+            view; ``hidden``: poses at which nothing is in the image; ``led``: hold each pose until
+            the person who sees its frames, whose first pixel counts the poses, has said so.
     """
     rng = np.random.default_rng(7)
     poses, pixels = holds(asked.get("poses", 9), asked.get("seed", 1))
@@ -84,12 +89,18 @@ def stream(asked: dict):
     reference[:3, :3] = Rotation.from_rotvec([0.1, 0.2, -0.3]).as_matrix()
     reference[:3, 3] = [-300.0, 100.0, -1500.0]
     stamp = START_S + asked.get("seed", 1)
+    count = seen
     while True:
         for step, index in enumerate(order):
+            count += 1
             hidden = index in asked.get("hidden", ())
-            shown = empty if hidden else frame(rng, pixels[index])
+            shown = empty.copy() if hidden else frame(rng, pixels[index])
+            shown[0, 0] = count % 256
             following = poses[order[(step + 1) % len(order)]]
-            for number in range(HOLD + TRAVEL):
+            number = -1
+            while number < HOLD + TRAVEL - 1:
+                if number != HOLD - 1 or not asked.get("led") or seen >= count:
+                    number += 1
                 stamp += PERIOD_S
                 # A hand is never quite at rest, and a head rests on the reference.
                 reference[:3, 3] += rng.normal(0, 0.2, 3)
@@ -151,12 +162,13 @@ def messages(asked: dict):
 
 
 def main(asked: dict) -> None:
-    """Serve one client after the other until standard input ends."""
+    """Serve one client after the other until standard input ends, whose lines are poses seen."""
+    global seen
     listener = socket.create_server(("127.0.0.1", asked.get("port", 0)))
     print(json.dumps({"port": listener.getsockname()[1]}), flush=True)
     threading.Thread(target=serve, args=(listener, asked), daemon=True).start()
-    while sys.stdin.buffer.read(64):
-        pass
+    for line in sys.stdin:
+        seen = int(line)
 
 
 def serve(listener: socket.socket, asked: dict) -> None:

@@ -40,22 +40,22 @@ PlusServer = Callable[..., int]
 """Starts a server of what is asked for; its port."""
 
 
+def started(processes: ExitStack, **asked) -> tuple[subprocess.Popen, int]:
+    """A server and its port; it has a process of its own: its hand holds still for a moment."""
+    process = subprocess.Popen(
+        [sys.executable, str(SERVER), json.dumps(asked)],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    processes.enter_context(process)
+    processes.callback(process.kill)
+    assert process.stdout is not None
+    return process, json.loads(process.stdout.readline())["port"]
+
+
 @contextmanager
 def starting() -> Iterator[PlusServer]:
-    """Each server has a process of its own: its hand holds still for a fraction of a second."""
     with ExitStack() as processes:
-
-        def start(**asked) -> int:
-            process = subprocess.Popen(
-                [sys.executable, str(SERVER), json.dumps(asked)],
-                stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-            )  # fmt: skip
-            processes.enter_context(process)
-            processes.callback(process.kill)
-            assert process.stdout is not None
-            return json.loads(process.stdout.readline())["port"]
-
-        yield start
+        yield lambda **asked: started(processes, **asked)[1]
 
 
 @pytest.fixture
@@ -83,12 +83,14 @@ class Scripted:
 
     def __init__(self, **presses: str) -> None:
         self.lines: list[str] = []
+        self._patience = time.monotonic() + 240.0
         self.words: set[str] = set()
         self.advice: set[str] = set()
         self._presses, self._pending = presses, []
 
     def show(self, frame: np.ndarray, words: str, advice: str) -> None:
         assert frame.shape in ((ROWS, COLUMNS), (100, 140))
+        assert time.monotonic() < self._patience, words
         self.words.add(re.sub(r"[\d.]+", "#", words))
         self.advice.add(advice)
 
@@ -103,6 +105,20 @@ class Scripted:
         if key == "ctrl-c":
             raise KeyboardInterrupt
         return key
+
+
+class Leading(Scripted):
+    """Leads the hand to its next pose once something was said of the images of this one."""
+
+    def __init__(self, server: subprocess.Popen, **presses: str) -> None:
+        super().__init__(**presses)
+        self._server, self._seen = server, 0
+
+    def show(self, frame: np.ndarray, words: str, advice: str) -> None:
+        super().show(frame, words, advice)
+        if not words.startswith(("moving", "hold still")) and frame[0, 0] != self._seen:
+            self._seen = frame[0, 0]
+            print(self._seen, file=self._server.stdin, flush=True)
 
 
 def check(path: Path, wanted: int, *, among: Collection[int] = range(9), count: int = 9) -> None:
@@ -175,13 +191,16 @@ def test_images_and_transforms_apart(tmp_path, separate):
     assert jaxcal.load(tmp_path / "r.h5").pose_frames == ("Probe", "Reference")
 
 
-def test_what_is_not_taken_is_said(tmp_path, plus_server):
+def test_what_is_not_taken_is_said(tmp_path):
     """Out of view, nothing credible, and a pose that was there before; u takes an image back."""
-    person = Scripted(image_3="u")
     order = [0, 1, 2, 1, 3, 4, 5, 6]
-    port = plus_server(mode="separate", order=order, lost=[3], hidden=[4])
-    asked = FreeHand("127.0.0.1", port, images=5)
-    assert acquire_free_hand(tmp_path / "r.h5", asked, person) == 5
+    with ExitStack() as processes:
+        server, port = started(
+            processes, mode="separate", led=True, order=order, lost=[3], hidden=[4]
+        )
+        person = Leading(server, image_3="u")
+        asked = FreeHand("127.0.0.1", port, images=5)
+        assert acquire_free_hand(tmp_path / "r.h5", asked, person) == 5
     assert "not tracked: ProbeToTracker is not tracked" in person.words
     assert any(words.startswith("no credible target: nothing stands out") for words in person.words)
     assert any(words.startswith("as in image #") for words in person.words)
@@ -430,6 +449,21 @@ def test_an_image_waits_for_the_pose_of_a_negative_lag(separate):
         # The stream's stamps run six times as fast as the clock on the wall.
         images = PosedImages(stream, lag_s=-4.0)
         assert images.read(3.0).pose is not None
+
+
+def test_images_that_were_dropped_before_the_start_do_not_matter(separate):
+    """Of a machine that was busy, the first image and the first transform were compared.
+
+    All images were then said to be of a clock that was set.
+    """
+    with UltrasoundStream("127.0.0.1", separate, queue=8) as stream:
+        started = time.monotonic()
+        while stream.statistics().dropped < 20:
+            assert time.monotonic() - started < 60.0
+            time.sleep(0.01)
+        images = PosedImages(stream)
+        assert not images.by_arrival
+        assert [each.why for _ in range(9) if (each := images.read(60.0)).pose is None] == []
 
 
 @contextmanager
