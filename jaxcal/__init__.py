@@ -27,6 +27,10 @@ class FormatError(InputError):
     """A file cannot be read: it has another format or a newer version, is truncated or unsafe."""
 
 
+class MissingFileError(FormatError, FileNotFoundError):
+    """There is no file or folder of this name."""
+
+
 class OutputError(CalibrationError, OSError):
     """A result could not be written; nothing was left half-written."""
 
@@ -35,7 +39,14 @@ class MissingExtraError(CalibrationError, ImportError):
     """An optional dependency is absent; the message names the extra that installs it."""
 
 
-_ERRORS = ("CalibrationError", "FormatError", "InputError", "MissingExtraError", "OutputError")
+_ERRORS = (
+    "CalibrationError",
+    "FormatError",
+    "InputError",
+    "MissingExtraError",
+    "MissingFileError",
+    "OutputError",
+)
 _HOME = {
     "Calibration": "jaxcal.result.calibration",
     "Certificate": "jaxcal.solvers.closed_form.reduced_objective",

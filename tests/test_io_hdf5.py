@@ -18,11 +18,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxcal import FormatError, InputError, OutputError
+from jaxcal import FormatError, InputError, MissingFileError, OutputError, load_calibration
 from jaxcal.data.probe import LinearProbe
 from jaxcal.data.recording import Images, MetresError, Recording, Truth, make_images
 from jaxcal.io import hdf5, untrusted
 from jaxcal.io.hdf5 import load, save
+from jaxcal.study.results import open_results
 
 ROOT = Path(__file__).parents[1]
 COUNT = 6
@@ -123,7 +124,7 @@ def refused(path, message, error=FormatError):
         load(path)
     assert str(caught.value).startswith(f"{path}: ")
     assert "\n" not in str(caught.value)
-    assert type(caught.value) in (InputError, FormatError, MetresError)
+    assert type(caught.value) in (InputError, FormatError, MetresError, MissingFileError)
     return str(caught.value)
 
 
@@ -283,6 +284,13 @@ def test_scale_on_the_group(path):
 def test_not_hdf5(tmp_path, content):
     (tmp_path / "rec.h5").write_bytes(content)
     refused(tmp_path / "rec.h5", "not an HDF5 file|truncated or damaged")
+
+
+@pytest.mark.parametrize("read", [load, load_calibration, open_results])
+def test_a_missing_file_is_python_s_own_error_too(read, tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"none\.npz: no such f") as told:
+        read(tmp_path / "none.npz")
+    assert type(told.value) is MissingFileError
 
 
 def test_missing_empty_directory_device_and_name(tmp_path):

@@ -8,7 +8,7 @@ import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from jaxcal import FormatError, InputError
+from jaxcal import FormatError, InputError, MissingFileError
 from jaxcal.runtime.messages import shown
 
 
@@ -31,15 +31,16 @@ def check_readable(path: str | os.PathLike[str], *, maximum_bytes: int | None = 
     """Check that a path names an ordinary, readable, non-empty file of at most ``maximum_bytes``.
 
     Raises:
-        FormatError: missing, a directory, a device or pipe (opening one may hang), not permitted,
-            empty or too large; one line that starts with the path.
+        MissingFileError: there is none of this name.
+        FormatError: a directory, a device or pipe (opening one may hang), not permitted, empty or
+            too large. The message of either error is one line that starts with the path.
         InputError: no path.
     """
     path = path_name(path)
     try:
         status = os.stat(path)
     except FileNotFoundError:
-        raise FormatError(f"{path}: no such file") from None
+        raise MissingFileError(f"{path}: no such file") from None
     except (OSError, ValueError) as error:
         raise FormatError(f"{path}: cannot be opened: {one_line(error)}") from None
     if stat.S_ISDIR(status.st_mode):

@@ -99,10 +99,11 @@ def load(path: str | os.PathLike[str]) -> Recording:
         The checked recording.
 
     Raises:
-        FormatError: no such file, not HDF5, truncated or damaged, another format, a newer version,
-            incomplete, wrong units, shapes or types, data that lie outside the file, absurd sizes.
+        MissingFileError: there is none of this name.
+        FormatError: not HDF5, truncated or damaged, another format, a newer version, incomplete,
+            wrong units, shapes or types, data that lie outside the file, absurd sizes.
         InputError: well-formed but unusable: NaN, a reflection, metres, fewer than 4 images.
-            Either is one line that starts with the path.
+            The message of each is one line that starts with the path.
     """
     check_readable(path)
     if not h5py.is_hdf5(path):

@@ -270,9 +270,10 @@ def load_calibration(path: str | os.PathLike[str]) -> ImageTransform:
             PLUS's matrix as ``.npy``.
 
     Raises:
+        MissingFileError: there is none of this name.
         FormatError: not such a file.
-        InputError: matrices that cannot be used. The message of either error is one line that
-            starts with the path.
+        InputError: matrices that cannot be used. The message of each error is one line that starts
+            with the path.
     """
     name = path_name(path)
     lower = name.lower()

@@ -26,7 +26,7 @@ from typing import Any, Generic, TypeVar, overload
 import h5py
 import numpy as np
 
-from jaxcal import FormatError, InputError
+from jaxcal import FormatError, InputError, MissingFileError
 from jaxcal.io.atomic import made_folder, write_bytes, write_text
 from jaxcal.io.given_files import check_readable, one_line, path_name
 from jaxcal.io.untrusted import array, child, number, open_root, text
@@ -226,7 +226,7 @@ def read_spec(folder: str | os.PathLike[str], kind: type[Any] = Spec) -> Any:
     """
     path = Path(path_name(folder)) / "spec.json"
     if not os.path.isdir(folder):
-        raise FormatError(f"{folder}: no such folder")
+        raise MissingFileError(f"{folder}: no such folder")
     if not os.path.exists(path):
         raise FormatError(f"{folder}: holds no study (no spec.json)")
     check_readable(path, maximum_bytes=8 * MAXIMUM_BYTES)
