@@ -29,6 +29,9 @@ LISTEN_S = 5.0
 """How long to wait for the first image and the first transform."""
 _MORE_S = 0.5
 """How long to listen after both have come, so that all names are known."""
+_SILENT_S = 0.2
+"""A longer silence does not count as listening."""
+_TICK_S = 0.01
 _LONGEST_GAP_S = 0.2
 """Longest time between two transforms over which they are interpolated."""
 _LONGEST_IMAGE_GAP_S = 0.3
@@ -138,7 +141,7 @@ class PosedImages:
             StaleError: no image in time.
             LostError: the connection is gone.
         """
-        deadline = time.monotonic() + timeout_s
+        left = timeout_s
         while True:
             self._take()
             if self._waiting:
@@ -148,38 +151,50 @@ class PosedImages:
                 if posed is not None:
                     self._waiting.popleft()
                     return posed
-            elif time.monotonic() > deadline:
+            elif left <= 0.0:
                 raise StaleError(
                     f"no new image for {timeout_s:g} s: is the machine frozen?", device="ultrasound"
                 )
-            time.sleep(0.005)
+            # Counted by its sleeps: see _listen.
+            time.sleep(_TICK_S / 2)
+            left -= _TICK_S / 2
 
     def _listen(self) -> None:
-        """Listen until images and transforms have come, and a moment longer."""
-        started = time.monotonic()
-        both: float | None = None
-        while both is None or time.monotonic() - both < _MORE_S:
+        """Listen until images and transforms have come, and a moment longer.
+
+        Only what flows is listened to: a stream, or a process, that is held up right after the
+        first messages has not named all transforms and devices yet.
+        """
+        waited = heard = silent = 0.0
+        came, both = 0, False
+        while heard < _MORE_S and waited < LISTEN_S:
+            # Counted by its sleeps: a process that was suspended has not waited meanwhile.
+            time.sleep(_TICK_S)
             self._take()
-            if both is None and self._waiting and self._samples:
-                both = time.monotonic()
-            if both is None and time.monotonic() - started > LISTEN_S:
-                missing = "images" if not self._waiting else "transforms"
-                counts = self._stream.statistics()
-                reason = counts.reason
-                if not self._waiting and counts.other_devices:
-                    raise DeviceError(
-                        f"{self._stream.address} sends no images of the device that was named, "
-                        f"but of {', '.join(map(repr, counts.other_devices))}: name one of these "
-                        "(--device), or none",
-                        device="ultrasound",
-                    )
-                raise DeviceError(
-                    f"{self._stream.address} sent no {missing} within {LISTEN_S:g} s"
-                    + (f" that can be used ({reason})" if reason else "")
-                    + ": does its configuration send IMAGE and TRANSFORM, or TRACKEDFRAME?",
-                    device="ultrasound" if not self._waiting else "tracker",
-                )
-            time.sleep(0.01)
+            counts = self._stream.statistics()
+            now = counts.received + counts.transforms
+            silent = silent + _TICK_S if now == came else 0.0
+            came, waited = now, waited + _TICK_S
+            if self._waiting and self._samples:
+                both, waited = True, waited if both else 0.0
+                heard += _TICK_S if silent < _SILENT_S else 0.0
+        if both:
+            return
+        missing = "images" if not self._waiting else "transforms"
+        reason = counts.reason
+        if not self._waiting and counts.other_devices:
+            raise DeviceError(
+                f"{self._stream.address} sends no images of the device that was named, "
+                f"but of {', '.join(map(repr, counts.other_devices))}: name one of these "
+                "(--device), or none",
+                device="ultrasound",
+            )
+        raise DeviceError(
+            f"{self._stream.address} sent no {missing} within {LISTEN_S:g} s"
+            + (f" that can be used ({reason})" if reason else "")
+            + ": does its configuration send IMAGE and TRANSFORM, or TRACKEDFRAME?",
+            device="ultrasound" if not self._waiting else "tracker",
+        )
 
     def _take(self) -> None:
         for transform in self._stream.transforms():

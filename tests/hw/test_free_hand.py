@@ -16,7 +16,16 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from plus_server import COLUMNS, ROWS, SPACING_MM, TARGET_MM, frame, holds, image_to_probe
+from plus_server import (
+    COLUMNS,
+    ROWS,
+    SPACING_MM,
+    TARGET_MM,
+    frame,
+    holds,
+    image_to_probe,
+    messages,
+)
 from scipy.spatial.transform import Rotation
 
 import jaxcal
@@ -464,6 +473,30 @@ def test_images_that_were_dropped_before_the_start_do_not_matter(separate):
         images = PosedImages(stream)
         assert not images.by_arrival
         assert [each.why for _ in range(9) if (each := images.read(60.0)).pose is None] == []
+
+
+def test_frames_that_are_held_up_at_the_start_are_known_all_the_same():
+    """The poses of the whole run were those in the tracker's frame, without the reference."""
+    first = messages({"mode": "separate"})
+    cut = next(first)
+    # The image and ProbeToTracker; a transform has a header, extended header and 48 bytes of matrix.
+    size = cut.index(b"ReferenceToTracker") - 14
+
+    def serve() -> None:
+        with listener.accept()[0] as connection, suppress(OSError):
+            connection.sendall(cut[:size])
+            time.sleep(0.8)
+            connection.sendall(cut[size:])
+            for more in first:
+                connection.sendall(more)
+                time.sleep(0.01)
+
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        thread = threading.Thread(target=serve)
+        thread.start()
+        with UltrasoundStream(*listener.getsockname()) as stream:
+            assert PosedImages(stream).pair == ("Probe", "Reference")
+        thread.join()
 
 
 @contextmanager
