@@ -166,7 +166,7 @@ class PosedImages:
         first messages has not named all transforms and devices yet.
         """
         waited = heard = silent = 0.0
-        came, both = 0, False
+        came, both, counts = 0, False, self._stream.statistics()
         while heard < _MORE_S and waited < LISTEN_S:
             # Counted by its sleeps: a process that was suspended has not waited meanwhile.
             time.sleep(_TICK_S)

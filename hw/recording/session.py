@@ -211,6 +211,10 @@ class Session:
                 clear_since = None
                 if now > deadline or not isinstance(error, StaleError):
                     raise error
+                if self._is_late():
+                    # A question that was held up says so of every frame after it: ask again.
+                    with suppress(StaleError):
+                        self._measure_echo_delay()
             time.sleep(_PERIOD_WALL_S)
 
     def _trouble(self) -> Exception | None:
@@ -235,10 +239,9 @@ class Session:
                     f"no frame for {now - self._echo_seen:.2f} s: {SILENT}",
                     device="active echo",
                 )
-            late = self._echo_frames[-1].late_s if self._echo_frames else 0.0
-            if late > self.clock.patience(watch.echo_late_s):
+            if self._is_late():
                 return StaleError(
-                    f"echo frames are {late:.1f} s late: check the link to the device, e.g. a "
+                    f"echo frames are {self._echo_frames[-1].late_s:.1f} s late: check the link to the device, e.g. a "
                     "bridge from serial line to network",
                     device="active echo",
                 )
@@ -254,6 +257,11 @@ class Session:
         except DeviceError as error:
             return error
         return None
+
+    def _is_late(self) -> bool:
+        """Whether the newest echo frame may have come too late."""
+        late = self._echo_frames[-1].late_s if self._echo_frames else 0.0
+        return late > self.clock.patience(self.watch.echo_late_s)
 
     # Data
 

@@ -79,6 +79,27 @@ class Link:
                         client.sendall(held.pop(0)[1])
 
 
+def test_a_question_that_was_held_up_does_not_end_the_run(tmp_path):
+    """The delay of the echo frames was bounded by it, and only after 10 s by another one."""
+    with (
+        EmulatedRobot() as robot,
+        AuspisEmulator(silence, clock=robot.clock, lines=8) as emulator,
+        Recorder(tmp_path / "r.h5", RecordingHeader("pixel", {}, 8, settings="{}")) as recorder,
+    ):
+        scene = Scene(np.eye(4), np.array([400.0, -100.0, 0.0]), np.array([0.0, 0.0, -1.0]))
+        setup = Setup(
+            robot.host, emulator.path, scene, {}, None,
+            probe=LinearProbe(elements=8), clock=robot.clock,
+        )  # fmt: skip
+        with Session(setup, recorder) as session:
+            with session.echo._changed:  # its reader waits
+                threading.Thread(target=session.echo.measure_delay, daemon=True).start()
+                time.sleep(0.6)
+            time.sleep(0.2)
+            assert "late: check the link" in str(session.trouble())
+            session.wait_until_clear()
+
+
 def test_an_image_that_a_slow_link_holds_up_is_not_of_the_next_pose(tmp_path):
     """The robot arrived after it was made: a target's place was measured at the wrong pose."""
     scene = Scene(np.eye(4), np.array([400.0, -100.0, 0.0]), np.array([0.0, 0.0, -1.0]))
