@@ -241,8 +241,8 @@ class Session:
                 )
             if self._is_late():
                 return StaleError(
-                    f"echo frames are {self._echo_frames[-1].late_s:.1f} s late: check the link to the device, e.g. a "
-                    "bridge from serial line to network",
+                    f"echo frames are {self._echo_frames[-1].late_s:.1f} s late: check the link to "
+                    "the device, e.g. a bridge from serial line to network",
                     device="active echo",
                 )
             if self.images is not None and now - self._image_seen > self.clock.patience(

@@ -479,7 +479,7 @@ def test_frames_that_are_held_up_at_the_start_are_known_all_the_same():
     """The poses of the whole run were those in the tracker's frame, without the reference."""
     first = messages({"mode": "separate"})
     cut = next(first)
-    # The image and ProbeToTracker; a transform has a header, extended header and 48 bytes of matrix.
+    # The image and ProbeToTracker.
     size = cut.index(b"ReferenceToTracker") - 14
 
     def serve() -> None:

@@ -92,10 +92,12 @@ def test_a_question_that_was_held_up_does_not_end_the_run(tmp_path):
             probe=LinearProbe(elements=8), clock=robot.clock,
         )  # fmt: skip
         with Session(setup, recorder) as session:
-            with session.echo._changed:  # its reader waits
-                threading.Thread(target=session.echo.measure_delay, daemon=True).start()
-                time.sleep(0.6)
-            time.sleep(0.2)
+            sent = robot.clock.now()
+            time.sleep(0.6)
+            _, count = session.echo.trigger_count()
+            with session.echo._changed:  # as the first question of a session
+                session.echo._asked, session.echo._anchor = (sent, count), None
+            time.sleep(0.3)
             assert "late: check the link" in str(session.trouble())
             session.wait_until_clear()
 
