@@ -218,7 +218,8 @@ def test_a_worker_does_not_finish_the_chunk_of_a_parent_that_is_gone(tmp_path, m
 def test_a_file_names_the_versions_that_computed_it_not_those_that_wrote_it(tmp_path, squares):
     """A worker of a cluster may have others."""
     study = squares()
-    store = Store.create(tmp_path / "study", study, resume=False)
+    store = Store(tmp_path / "study", study)
+    store.prepare(resume=False)
     chunk = study.chunk(0)
     maker = {"jaxcal": "9.9.9", "jax": "8.8.8", "device": "4 x gpu"}
     store.write(chunk, study.compute(chunk), maker)
