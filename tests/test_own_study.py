@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import json
 import os
+import select
 import signal
 import subprocess
 import sys
@@ -178,16 +179,47 @@ def test_a_worker_whose_parent_is_gone_ends_without_a_word(squares):
     given = {"spec": study.canonical(), "where": where_defined(study), "cores": [], "cache": False}
     worker.stdout.close()
     worker.stdin.write(f'{json.dumps(given)}\n{{"chunk": 0}}\n')
-    worker.stdin.close()
+    worker.stdin.flush()
     assert worker.wait(timeout=600) == 1
     assert worker.stderr.read() == ""
+    worker.stdin.close()
     worker.stderr.close()
+
+
+ENDLESS = """
+
+class Endless(Squares):
+    def compute(self, chunk):
+        print("computing", flush=True)
+        import time
+        time.sleep(10_000)
+"""
+
+
+@pytest.mark.skipif(not hasattr(select, "poll"), reason="Windows does not tell of a pipe's end")
+def test_a_worker_does_not_finish_the_chunk_of_a_parent_that_is_gone(tmp_path, monkeypatch):
+    """A killed study's workers would compute on, for minutes, beside its resumption."""
+    (tmp_path / "loose_endless.py").write_text(MODULE + ENDLESS)
+    monkeypatch.syspath_prepend(tmp_path)
+    study = importlib.import_module("loose_endless").Endless()
+    given = {"spec": study.canonical(), "where": where_defined(study), "cores": [], "cache": False}
+    command = python_command("jaxcal.study.workers")
+    with subprocess.Popen(command, stdin=PIPE, stdout=PIPE, stderr=PIPE, text=True) as worker:
+        try:
+            worker.stdin.write(f'{json.dumps(given)}\n{{"chunk": 0}}\n')
+            worker.stdin.flush()
+            assert worker.stderr.readline() == "computing\n"
+            worker.stdin.close()
+            assert worker.wait(timeout=60) == 1
+        finally:
+            worker.kill()
 
 
 def test_a_file_names_the_versions_that_computed_it_not_those_that_wrote_it(tmp_path, squares):
     """A worker of a cluster may have others."""
     study = squares()
-    store = Store.create(tmp_path / "study", study, resume=False)
+    store = Store(tmp_path / "study", study)
+    store.prepare(resume=False)
     chunk = study.chunk(0)
     maker = {"jaxcal": "9.9.9", "jax": "8.8.8", "device": "4 x gpu"}
     store.write(chunk, study.compute(chunk), maker)

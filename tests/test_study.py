@@ -468,7 +468,7 @@ def test_unwritable_folder(tmp_path, capsys):
     # Somebody else's lock.
     (tmp_path / "shared" / ".lock").mkdir(parents=True)
     assert main(["study", "run", str(path), "--out", str(tmp_path / "shared")]) == 2
-    assert "shared/.lock: cannot be written: Is a directory; 0 of" in capsys.readouterr().err
+    assert "shared/.lock: cannot be written: Is a directory\n" in capsys.readouterr().err
     # An unset variable of a shell would be the current folder.
     assert main(["study", "run", str(path), "--out", ""]) == 2
     assert capsys.readouterr().err == "jaxcal: error: the name of a file or folder is empty\n"
@@ -569,6 +569,14 @@ def test_two_processes_do_not_share_a_folder(finished, tmp_path, capsys):
         fcntl.flock(held, fcntl.LOCK_EX)
         assert main(["study", "run", str(path), "--out", str(finished), "--resume"]) == 2
     assert "is being computed by another process" in capsys.readouterr().err
+    # One that has only just begun may have another spec, which must not be replaced.
+    new = tmp_path / "new"
+    new.mkdir()
+    with (new / ".lock").open("wb") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        assert main(["study", "run", str(path), "--out", str(new)]) == 2
+    assert "is being computed by another process" in capsys.readouterr().err
+    assert not (new / "spec.json").exists()
 
 
 def test_full_file_system(long_study, tmp_path):

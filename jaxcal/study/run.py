@@ -109,8 +109,10 @@ def run_study(
         no_interrupt_lost(),
         nullcontext() if scheduler is None else connected(scheduler) as client,
     ):
-        store = Store.create(folder, spec, resume=resume)
+        store = Store(folder, spec)
+        store.prepare(resume=resume)
         with _locked(store.folder):
+            store.begin(resume=resume)
             store.sweep()
             missing, done = _missing(store, watcher)
             watcher.begin(spec.condition_count * spec.trials, done)

@@ -52,39 +52,47 @@ class Store(Generic[S]):
         self.folder = Path(path_name(folder))
         self.spec = spec
 
-    @classmethod
-    def create(cls, folder: str | os.PathLike[str], spec: S, *, resume: bool) -> Store[S]:
-        """Make the folder of a study, or continue one that exists.
+    def prepare(self, *, resume: bool) -> None:
+        """Make the folder of a study with its parents, if need be.
 
         Args:
-            folder: made if need be, with its parents.
-            spec: the study.
             resume: whether an existing study may be continued.
 
         Raises:
             InputError: the folder holds another study, or this one while ``resume`` is false.
             OutputError: the folder cannot be made or written to. Nothing was written then.
         """
-        store = cls(folder, spec)
-        if store.is_begun():
-            found = read_spec(folder, type(spec))
-            if found.sha256 != spec.sha256:
-                raise InputError(
-                    f"{folder}: holds the results of another spec (it differs in "
-                    f"{_difference(found, spec)}): choose another folder, or go back to that spec"
-                )
-            if not resume:
-                raise InputError(
-                    f"{folder}: holds this study already: --resume continues it "
-                    "(in Python resume=True)"
-                )
-            store._make_folder()
-            return store
-        store._make_folder()
-        if store.present():
-            raise InputError(f"{folder}: holds results but no spec.json: choose another folder")
-        write_text(store._spec_path, spec.canonical() + "\n")
-        return store
+        begun = self._is_continued(resume)
+        with made_folder(self.folder), made_folder(self.folder / "chunks"):
+            pass
+        if not begun and self.present():
+            raise InputError(
+                f"{self.folder}: holds results but no spec.json: choose another folder"
+            )
+
+    def begin(self, *, resume: bool) -> None:
+        """Write the spec of a study that is not there yet; raises what :meth:`prepare` does.
+
+        Other processes must be locked out: two that begin at once would replace each other's spec.
+        """
+        if not self._is_continued(resume):
+            write_text(self._spec_path, self.spec.canonical() + "\n")
+
+    def _is_continued(self, resume: bool) -> bool:
+        if not self.is_begun():
+            return False
+        found = read_spec(self.folder, type(self.spec))
+        if found.sha256 != self.spec.sha256:
+            raise InputError(
+                f"{self.folder}: holds the results of another spec (it differs in "
+                f"{_difference(found, self.spec)}): choose another folder, or go back to that spec"
+            )
+        if not resume:
+            raise InputError(
+                f"{self.folder}: holds this study already: --resume continues it "
+                "(in Python resume=True)"
+            )
+        return True
 
     @staticmethod
     def open(folder: str | os.PathLike[str]) -> Store[Spec]:
@@ -197,10 +205,6 @@ class Store(Generic[S]):
     @property
     def _spec_path(self) -> Path:
         return self.folder / "spec.json"
-
-    def _make_folder(self) -> None:
-        with made_folder(self.folder), made_folder(self.folder / "chunks"):
-            pass
 
     def sweep(self) -> None:
         """Remove what a killed process had begun to write."""

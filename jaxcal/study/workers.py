@@ -12,6 +12,7 @@ import contextlib
 import json
 import os
 import queue
+import select
 import subprocess
 import sys
 import threading
@@ -190,6 +191,8 @@ def main() -> None:
     os.dup2(2, 1)
     requests = sys.stdin.buffer
     given = json.loads(requests.readline())
+    if hasattr(select, "poll"):  # not on Windows
+        threading.Thread(target=_end_with_parent, daemon=True).start()
     if given["cores"] and hasattr(os, "sched_setaffinity"):
         # Before JAX is imported, since JAX counts the cores.
         os.sched_setaffinity(0, given["cores"])
@@ -206,6 +209,15 @@ def main() -> None:
     except BrokenPipeError:
         # The parent was killed: nobody reads an answer, nor a traceback of what cannot be flushed.
         os._exit(1)
+
+
+def _end_with_parent() -> None:
+    """Wait until the parent is gone, then end this process: nobody wants its chunk."""
+    requests = select.poll()
+    # The end of a pipe is reported whatever is asked for. Its lines are the main thread's.
+    requests.register(0, 0)
+    requests.poll()
+    os._exit(1)
 
 
 def _answer(answers: BinaryIO, spec: Callable[[], Study], index: int) -> None:
