@@ -287,7 +287,7 @@ def test_not_hdf5(tmp_path, content):
 
 
 @pytest.mark.parametrize("read", [load, load_calibration, open_results])
-def test_a_missing_file_is_python_s_own_error_too(read, tmp_path):
+def test_a_missing_file_is_told_as_python_tells_it(read, tmp_path):
     with pytest.raises(FileNotFoundError, match=r"none\.npz: no such f") as told:
         read(tmp_path / "none.npz")
     assert type(told.value) is MissingFileError

@@ -32,6 +32,7 @@ _MORE_S = 0.5
 _SILENT_S = 0.2
 """A longer silence does not count as listening."""
 _TICK_S = 0.01
+"""Between two looks at the stream."""
 _LONGEST_GAP_S = 0.2
 """Longest time between two transforms over which they are interpolated."""
 _LONGEST_IMAGE_GAP_S = 0.3
