@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jaxcal
 from jaxcal.runtime import executables, program_cache
 
 X = np.arange(6.0).reshape(2, 3)
@@ -154,6 +155,25 @@ def test_threads_wait_for_the_one_that_compiles():
     for one in found:
         check(one)
     assert traced == [FACTOR]
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this platform does not fork")
+def test_a_forked_process_is_told_to_be_spawned():
+    """It waited without end for JAX's threads, which are in its parent alone."""
+    check(executables.run(scaled, (X,), FACTOR, flags=FLAGS, label={}))
+    read, write = os.pipe()
+    child = os.fork()
+    if not child:
+        try:
+            executables.run(scaled, (X,), FACTOR, flags=FLAGS, label={})
+        except jaxcal.CalibrationError as error:
+            os.write(write, str(error).encode())
+        finally:
+            os._exit(0)
+    os.close(write)
+    with open(read) as told:
+        assert "get_context('spawn')" in told.read()
+    assert os.waitpid(child, 0)[1] == 0
 
 
 def other_function(x, plan):

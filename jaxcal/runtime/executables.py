@@ -44,6 +44,7 @@ import jax
 import numpy as np
 from jaxlib import xla_client
 
+from jaxcal import CalibrationError
 from jaxcal.runtime import compiler, program_cache
 from jaxcal.runtime.arrays import assembled
 
@@ -146,6 +147,9 @@ def in_numpy(arrays: list[jax.Array]) -> list[np.ndarray]:
     return [np.asarray(array) for array in arrays]
 
 
+_computing: int | None = None
+"""The process that ran the first program: JAX's threads are in it, and in none forked from it."""
+
 _loaded: OrderedDict[str, _Program] = OrderedDict()
 _being_made: dict[str, Lock] = {}
 _lock = Lock()
@@ -176,7 +180,9 @@ def run(
 
     Raises:
         NotDescribableError: arguments or plan hold what cannot be described.
+        CalibrationError: this process was forked from one that has run a program.
     """
+    _refuse_after_fork()
     leaves: list[Any] = []
     described = describe(arguments, leaves)
     name = function
@@ -222,6 +228,18 @@ def run(
         program = compiled()
         _remember(key, program)
     return program(leaves, convert)
+
+
+def _refuse_after_fork() -> None:
+    """A program would wait without end for threads that the fork left behind."""
+    global _computing
+    _computing = _computing or os.getpid()
+    if _computing != os.getpid():
+        raise CalibrationError(
+            "jaxcal cannot compute in a process that was forked from one in which it has computed: "
+            "JAX's threads are not in it. Start processes by 'spawn', as by "
+            "multiprocessing.get_context('spawn')"
+        )
 
 
 def _imported(function: str | Callable[..., Any]) -> Callable[..., Any]:
