@@ -78,6 +78,41 @@ else:
 """
 
 
+THREADS = """
+import sys, time
+from concurrent.futures import ThreadPoolExecutor
+import numpy as np
+import jaxcal
+
+sys.setswitchinterval(1e-4)  # an import waits for its turn often
+problem = jaxcal.make_images(np.load("0-poses.npy"), np.load("0-points.npy"))
+begun, over, answers = [], False, []
+
+def solve():
+    while not over:
+        begun.append(over)
+        found = jaxcal.calibrate(problem, "conventional")
+        assert str(found)
+        answers.append(np.asarray(found.image_to_probe))
+
+with ThreadPoolExecutor() as pool:
+    working = [pool.submit(solve) for _ in range(2)]
+    while len(begun) < 8 and not working[0].done():
+        time.sleep(0.01)
+    import jax
+    over = True
+for each in working:
+    each.result()
+assert len(answers) == len(begun)
+print({answer.dtype.name for answer in answers}, len({answer.tobytes() for answer in answers}))
+"""
+
+
+def test_another_thread_may_import_jax_meanwhile(tmp_path):
+    """JAX was looked into before it was there, and answers that began without it had 32 bits."""
+    assert run_fresh(THREADS, tmp_path) == "{'float64'} 1\n"
+
+
 @pytest.mark.parametrize("jax_first", [True, False])
 def test_importing_and_calibrating_change_nothing_of_the_process(jax_first, tmp_path):
     said = run_fresh(PROCESS.format(jax_first=jax_first), tmp_path)

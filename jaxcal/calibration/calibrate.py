@@ -9,7 +9,6 @@ one pure function of arrays (:mod:`jaxcal.calibration.pipeline`).
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any, get_args
@@ -45,6 +44,7 @@ from jaxcal.runtime.jax_modes import (
     with_dtype,
 )
 from jaxcal.runtime.messages import shown
+from jaxcal.runtime.when_jax import jax_in_use
 from jaxcal.solvers.names import Data, Method, PriorName
 from jaxcal.solvers.plan import (
     LAWS,
@@ -216,7 +216,7 @@ def _solve_alone(problem: Problem, given: Given, plan: SolvePlan) -> Calibration
         from jaxcal.calibration.engine import solve_problem
 
         return solve_problem(problem, given, plan)
-    if "jax" in sys.modules:
+    if jax_in_use() is not None:
         from jaxcal.calibration.engine import as_jax_holds
 
         return as_jax_holds(found, problem)

@@ -8,7 +8,6 @@ same class with leading axes on every array.
 from __future__ import annotations
 
 import os
-import sys
 from dataclasses import replace
 from typing import Any
 
@@ -41,6 +40,7 @@ from jaxcal.runtime.arrays import (
 from jaxcal.runtime.given_values import refuse_masked
 from jaxcal.runtime.jax_modes import importing_jax, in_own_modes
 from jaxcal.runtime.messages import counted, shown
+from jaxcal.runtime.when_jax import jax_in_use
 
 _HOW = (
     "jaxcal.Problem.from_arrays(poses, measurements) makes one of arrays, jaxcal.load(path) reads "
@@ -199,7 +199,8 @@ class Problem:
         dtype = _floating(dtype)
 
         # device_put, since JAX would compile jax.numpy.asarray of a number.
-        put: Any = sys.modules["jax"].device_put if "jax" in sys.modules else lambda array: array
+        jax = jax_in_use()
+        put: Any = jax.device_put if jax is not None else lambda array: array
 
         def array(values: np.ndarray | float) -> Any:
             return put(np.asarray(values, dtype=dtype))

@@ -13,14 +13,13 @@ from __future__ import annotations
 
 import dataclasses
 import re
-import sys
 from collections.abc import Callable
 from functools import cache, partial
 from typing import Any, TypeVar, dataclass_transform
 
 import numpy as np
 
-from jaxcal.runtime.when_jax import when_jax_is_imported
+from jaxcal.runtime.when_jax import jax_in_use, when_jax_is_imported
 
 T = TypeVar("T")
 
@@ -31,8 +30,7 @@ _SHAPE = re.compile(r"""\[[^\[\]]*["']([^"']*)["']\]""")
 
 def is_traced(*values: object) -> bool:
     """Whether one of these values (pytrees) is traced by a jit, vmap or grad."""
-    # If JAX is not imported, nothing is traced.
-    jax = sys.modules.get("jax")
+    jax = jax_in_use()
     if jax is None:
         return False
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
@@ -40,7 +38,7 @@ def is_traced(*values: object) -> bool:
 
 def array_module(*values: object) -> Any:
     """What to compute with: jax.numpy where one of the values is traced, otherwise numpy."""
-    return sys.modules["jax"].numpy if is_traced(*values) else np
+    return jax_in_use().numpy if is_traced(*values) else np
 
 
 def like(before: Any, values: np.ndarray) -> Any:

@@ -20,7 +20,6 @@ Functions that need no JAX do not import it: if nobody has imported it, there ar
 from __future__ import annotations
 
 import importlib
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import wraps
@@ -30,6 +29,7 @@ import numpy as np
 
 from jaxcal import InputError
 from jaxcal.runtime.arrays import is_traced, map_arrays
+from jaxcal.runtime.when_jax import decided, jax_in_use
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -43,20 +43,15 @@ NO_64_BITS = (
 
 def is_float64_on() -> bool:
     """Whether JAX makes 64-bit arrays here and now; so does numpy where JAX is not imported."""
-    if "jax" not in sys.modules:
-        return True
-    import jax.numpy as jnp
-
-    return jnp.result_type(float) == np.float64
+    jax = jax_in_use()
+    return jax is None or jax.numpy.result_type(float) == np.float64
 
 
 def inside_transformation(*arguments: object) -> bool:
     """Whether the code that runs now is inside somebody else's jit, vmap or grad."""
-    if "jax" not in sys.modules:
+    jax = jax_in_use()
+    if jax is None:
         return False
-    import jax
-    import jax.core
-
     # Under jit even a constant is a tracer; under vmap and grad only what depends on an argument.
     # device_put, since jax.numpy.zeros would be compiled.
     marked = (arguments, jax.device_put(np.float32(0)))
@@ -91,19 +86,21 @@ def in_own_modes(function: Callable[P, T]) -> Callable[P, T]:
     result (a pytree) are returned as numpy arrays.
     """
 
-    @wraps(function)
-    def guest(*args: P.args, **kwargs: P.kwargs) -> T:
+    def in_modes(*args: P.args, **kwargs: P.kwargs) -> T:
+        jax = jax_in_use()
+        if jax is None:
+            return function(*args, **kwargs)
         if inside_transformation(args, kwargs):
             with own_modes(bits_too=False):
                 return function(*args, **kwargs)
-        if "jax" not in sys.modules:
-            return function(*args, **kwargs)
-        import jax
-
         keep = is_float64_on()
         with own_modes():
             result = function(*args, **kwargs)
             return result if keep else jax.tree.map(_without_jax, result)
+
+    @wraps(function)
+    def guest(*args: P.args, **kwargs: P.kwargs) -> T:
+        return decided(in_modes, *args, **kwargs)
 
     return guest
 
@@ -165,7 +162,7 @@ def require_float64(name: str) -> None:
 
 def with_dtype(tree: T, dtype: Any) -> T:
     """A pytree whose floating arrays, traced or not, have this dtype."""
-    if "jax" not in sys.modules:
+    if jax_in_use() is None:
         floating = np.floating
         return map_arrays(
             lambda a: a.astype(dtype, copy=False) if np.issubdtype(a.dtype, floating) else a, tree

@@ -6,7 +6,6 @@ The numbers in the request are a :class:`Given`, which is traced.
 
 from __future__ import annotations
 
-import sys
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, TypeGuard, get_args
@@ -20,6 +19,7 @@ from jaxcal.runtime.array_types import AnyArray, Float
 from jaxcal.runtime.arrays import array_tree, is_traced
 from jaxcal.runtime.given_values import check_flag, real_array, whole_number
 from jaxcal.runtime.messages import shown
+from jaxcal.runtime.when_jax import imported
 from jaxcal.solvers.names import Method, SolverName
 
 if TYPE_CHECKING:
@@ -155,7 +155,7 @@ def is_one_of(value: object, names: Any) -> bool:
 
 def is_optimistix(solver: Any) -> TypeGuard[optx.AbstractLeastSquaresSolver]:
     """Whether this is a least-squares solver of optimistix, without the slow import of it."""
-    found = sys.modules.get("optimistix")
+    found = imported("optimistix")
     return found is not None and isinstance(solver, found.AbstractLeastSquaresSolver)
 
 
