@@ -190,3 +190,36 @@ def test_a_circle_and_a_way_up_are_found():
     assert upwards({"hw.robot.gate": {"hw.cli.main", "hw.runtime.clock", "jaxcal.cli.main"}}) == [
         "hw.robot.gate imports hw.cli.main"
     ]
+
+
+def test_jax_is_imported_before_its_parts():
+    """Of two threads that import JAX, one by a part of it, each waits for what the other began.
+
+    Python ends that with half a module. ``import jax`` and ``from jax import numpy`` wait in turn.
+    """
+    early = []
+    for path in sources().values():
+        nodes = list(ast.walk(ast.parse(path.read_text())))
+        guards = [each for each in nodes if isinstance(each, ast.If)]
+        unseen = {
+            id(each)
+            for guard in guards
+            if ast.unparse(guard.test) == "TYPE_CHECKING"
+            for each in ast.walk(guard)
+        }
+        whole = False
+        for node in sorted(
+            (each for each in nodes if isinstance(each, ast.Import | ast.ImportFrom)),
+            key=lambda each: each.lineno,
+        ):
+            if id(node) in unseen:
+                continue
+            names = (
+                [each.name for each in node.names]
+                if isinstance(node, ast.Import)
+                else [node.module or ""]
+            )
+            whole = whole or not {"jax", "equinox", "optimistix"}.isdisjoint(names)
+            if not whole and any(name.startswith("jax.") for name in names):
+                early.append(f"{path.relative_to(HOME)}:{node.lineno}")
+    assert not early

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 
-import jax.numpy as jnp
+from jax import numpy as jnp
 from jaxtyping import Array, Float
 
 _SMALL_ANGLE_SQUARED = 1e-2

@@ -115,7 +115,7 @@ def gain(
         weight: W, by which the criterion is the trace tr(W S), e.g. of :func:`tre_weight`.
         model: X, target and SDs.
     """
-    import jax.numpy as jnp
+    from jax import numpy as jnp
 
     check_made("model", model, Model, "jaxcal.design.Model")
     square = (model.size, model.size)

@@ -45,7 +45,7 @@ def like(before: Any, values: np.ndarray) -> Any:
     """Values as a numpy or JAX array of the dtype of another array, like that one."""
     if isinstance(before, np.ndarray):
         return values.astype(before.dtype)
-    import jax.numpy as jnp
+    from jax import numpy as jnp
 
     return jnp.asarray(values, before.dtype)
 
@@ -144,12 +144,12 @@ def finite_or_none(value: Any) -> float | None:
 
 
 def _register(kind: type) -> None:
-    from jax.tree_util import GetAttrKey, register_pytree_with_keys
+    from jax import tree_util
 
     fields = dataclasses.fields(kind)
     names = tuple(field.name for field in fields if _STATIC not in field.metadata)
     others = tuple(field.name for field in fields if _STATIC in field.metadata)
-    keys = tuple(GetAttrKey(name) for name in names)
+    keys = tuple(tree_util.GetAttrKey(name) for name in names)
 
     def parts(tree: Any) -> tuple[tuple, tuple]:
         held = vars(tree)
@@ -167,4 +167,4 @@ def _register(kind: type) -> None:
         held.update(zip(others, rest, strict=True))
         return made
 
-    register_pytree_with_keys(kind, parts_with_keys, whole, parts)
+    tree_util.register_pytree_with_keys(kind, parts_with_keys, whole, parts)
