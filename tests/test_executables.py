@@ -164,15 +164,20 @@ def test_a_forked_process_is_told_to_be_spawned():
     read, write = os.pipe()
     child = os.fork()
     if not child:
+        poses = np.tile(np.eye(4), (9, 1, 1))
         try:
-            executables.run(scaled, (X,), FACTOR, flags=FLAGS, label={})
-        except jaxcal.CalibrationError as error:
-            os.write(write, str(error).encode())
+            for call in (
+                lambda: executables.run(scaled, (X,), FACTOR, flags=FLAGS, label={}),
+                lambda: jaxcal.calibrate_pivot(poses),  # computes before it runs a program
+            ):
+                with pytest.raises(jaxcal.CalibrationError, match=r"get_context\('spawn'\)"):
+                    call()
+                os.write(write, b"told ")
         finally:
             os._exit(0)
     os.close(write)
     with open(read) as told:
-        assert "get_context('spawn')" in told.read()
+        assert told.read() == "told told "
     assert os.waitpid(child, 0)[1] == 0
 
 

@@ -206,8 +206,10 @@ def calibrate_pivot(
         InputError: poses or a mask of another shape, or what are no numbers; concrete poses, not
             of a batch, that are not rigid transforms or look like metres, or fewer than 4 used
             ones.
+        CalibrationError: this process was forked from one in which jaxcal has computed.
     """
     check_flag("robust", robust)
+    executables.refuse_after_fork()
     if not isinstance(poses, jax.Array):
         poses = real_array(poses, "poses")
     shape = np.shape(poses)

@@ -182,7 +182,7 @@ def run(
         NotDescribableError: arguments or plan hold what cannot be described.
         CalibrationError: this process was forked from one that has run a program.
     """
-    _refuse_after_fork()
+    refuse_after_fork()
     leaves: list[Any] = []
     described = describe(arguments, leaves)
     name = function
@@ -230,8 +230,12 @@ def run(
     return program(leaves, convert)
 
 
-def _refuse_after_fork() -> None:
-    """A program would wait without end for threads that the fork left behind."""
+def refuse_after_fork() -> None:
+    """Refuse to compute where it would wait without end for threads that a fork left behind.
+
+    Raises:
+        CalibrationError: this process was forked from one that has run a program.
+    """
     global _computing
     _computing = _computing or os.getpid()
     if _computing != os.getpid():
