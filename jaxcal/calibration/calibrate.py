@@ -34,7 +34,7 @@ from jaxcal.model.unknowns import (
 )
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import AnyArray, Array
-from jaxcal.runtime.arrays import array_module, array_tree, is_traced, static
+from jaxcal.runtime.arrays import array_module, array_tree, is_traced, jax_in_use, static
 from jaxcal.runtime.given_values import check_flag, whole_number
 from jaxcal.runtime.jax_modes import (
     importing_jax,
@@ -44,7 +44,6 @@ from jaxcal.runtime.jax_modes import (
     with_dtype,
 )
 from jaxcal.runtime.messages import shown
-from jaxcal.runtime.when_jax import jax_in_use
 from jaxcal.solvers.names import Data, Method, PriorName
 from jaxcal.solvers.plan import (
     LAWS,

@@ -34,13 +34,13 @@ from jaxcal.runtime.arrays import (
     array_tree,
     each_image,
     is_traced,
+    jax_in_use,
     map_arrays,
     static,
 )
 from jaxcal.runtime.given_values import refuse_masked
 from jaxcal.runtime.jax_modes import importing_jax, in_own_modes
 from jaxcal.runtime.messages import counted, shown
-from jaxcal.runtime.when_jax import jax_in_use
 
 _HOW = (
     "jaxcal.Problem.from_arrays(poses, measurements) makes one of arrays, jaxcal.load(path) reads "

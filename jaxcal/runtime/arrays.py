@@ -3,6 +3,10 @@
 Code for both computes with numpy, and with jax.numpy inside somebody's jit, vmap or grad
 (:func:`array_module`).
 
+Any thread may import JAX at any moment. Until the import ends, its module is there without its
+contents, so whoever needs them waits (:func:`imported`). A calculation that began without JAX ends
+without it, since it has entered none of JAX's modes (:func:`jax_in_use`).
+
 A tree is a frozen dataclass of arrays that JAX sees through (a pytree). The classes are registered
 when JAX is imported (:mod:`jaxcal.runtime.when_jax`), so problems and answers that were made before
 that are trees as well. An array with an axis of images is found by its annotation, where every
@@ -12,20 +16,47 @@ class of jaxcal names this axis ``n``.
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import re
+import sys
 from collections.abc import Callable
+from contextvars import ContextVar, copy_context
 from functools import cache, partial
-from typing import Any, TypeVar, dataclass_transform
+from typing import Any, ParamSpec, TypeVar, dataclass_transform
 
 import numpy as np
 
-from jaxcal.runtime.when_jax import jax_in_use, when_jax_is_imported
+from jaxcal.runtime.when_jax import when_jax_is_imported
 
+P = ParamSpec("P")
 T = TypeVar("T")
 
 _STATIC = "static"
 
 _SHAPE = re.compile(r"""\[[^\[\]]*["']([^"']*)["']\]""")
+
+_numpy_alone: ContextVar[bool] = ContextVar("jaxcal_numpy_alone", default=False)
+"""Whether the calculation that runs here began without JAX."""
+
+
+def imported(name: str) -> Any:
+    """A module that somebody has imported, or None; an import that is under way is waited for."""
+    return importlib.import_module(name) if name in sys.modules else None
+
+
+def jax_in_use() -> Any:
+    """JAX if it is imported and this calculation uses it, otherwise None."""
+    return None if _numpy_alone.get() else imported("jax")
+
+
+def decided(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+    """Call a function for which :func:`jax_in_use` is now decided, until it returns.
+
+    Whatever it calls through this function is decided anew.
+    """
+    context = copy_context()  # and no variable to set back, which a Ctrl-C could prevent
+    context.run(_numpy_alone.set, "jax" not in sys.modules)
+    return context.run(function, *args, **kwargs)
 
 
 def is_traced(*values: object) -> bool:

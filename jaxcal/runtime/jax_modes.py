@@ -28,8 +28,7 @@ from typing import Any, ParamSpec, TypeVar
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.runtime.arrays import is_traced, map_arrays
-from jaxcal.runtime.when_jax import decided, jax_in_use
+from jaxcal.runtime.arrays import decided, is_traced, jax_in_use, map_arrays
 
 P = ParamSpec("P")
 T = TypeVar("T")

@@ -1,50 +1,17 @@
-"""Whether JAX is imported, and actions for the time when it is, without importing it here.
+"""Actions for the time when JAX is imported, without importing it here.
 
 A recording can be calibrated without JAX, whose import takes longer than the calibration. So jaxcal
 sets up its parts of JAX when somebody imports it. A finder in front of the import system's own ones
 does this at the first ``import jax`` and then removes itself.
-
-Any thread may import JAX at any moment. Until the import ends, its module is there without its
-contents, so whoever needs them waits. A calculation that began without JAX ends without it: it has
-entered none of JAX's modes.
 """
 
 from __future__ import annotations
 
-import importlib
 import sys
 from collections.abc import Callable, Sequence
-from contextvars import ContextVar, copy_context
 from importlib.machinery import ModuleSpec
 from threading import Lock
 from types import ModuleType
-from typing import Any, ParamSpec, TypeVar
-
-P = ParamSpec("P")
-T = TypeVar("T")
-
-_numpy_alone: ContextVar[bool] = ContextVar("jaxcal_numpy_alone", default=False)
-
-
-def imported(name: str) -> Any:
-    """A module that somebody has imported, or None; an import that is under way is waited for."""
-    return importlib.import_module(name) if name in sys.modules else None
-
-
-def jax_in_use() -> Any:
-    """JAX if it is imported and this calculation uses it, otherwise None."""
-    return None if _numpy_alone.get() else imported("jax")
-
-
-def decided(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-    """Call a function for which :func:`jax_in_use` is now decided, until it returns.
-
-    Whatever it calls through this function is decided anew.
-    """
-    context = copy_context()  # and no variable to set back, which a Ctrl-C could prevent
-    context.run(_numpy_alone.set, "jax" not in sys.modules)
-    return context.run(function, *args, **kwargs)
-
 
 _lock = Lock()
 _waiting: list[Callable[[], None]] = []

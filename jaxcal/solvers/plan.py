@@ -16,10 +16,9 @@ from jaxcal import InputError
 from jaxcal.model.distributions import SHAPES, UNIFORM, Shape
 from jaxcal.model.unknowns import Blocks
 from jaxcal.runtime.array_types import AnyArray, Float
-from jaxcal.runtime.arrays import array_tree, is_traced
+from jaxcal.runtime.arrays import array_tree, imported, is_traced
 from jaxcal.runtime.given_values import check_flag, real_array, whole_number
 from jaxcal.runtime.messages import shown
-from jaxcal.runtime.when_jax import imported
 from jaxcal.solvers.names import Method, SolverName
 
 if TYPE_CHECKING:
