@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import problem
 
 import jaxcal
 from jaxcal.runtime import executables, program_cache
@@ -161,14 +162,18 @@ def test_threads_wait_for_the_one_that_compiles():
 def test_a_forked_process_is_told_to_be_spawned():
     """It waited without end for JAX's threads, which are in its parent alone."""
     check(executables.run(scaled, (X,), FACTOR, flags=FLAGS, label={}))
+    there, poses = problem(1), np.tile(np.eye(4), (9, 1, 1))
     read, write = os.pipe()
     child = os.fork()
     if not child:
-        poses = np.tile(np.eye(4), (9, 1, 1))
+        signal.alarm(60)
         try:
             for call in (
                 lambda: executables.run(scaled, (X,), FACTOR, flags=FLAGS, label={}),
-                lambda: jaxcal.calibrate_pivot(poses),  # computes before it runs a program
+                # These compute before they run a program.
+                lambda: jaxcal.calibrate_pivot(poses),
+                lambda: jaxcal.bootstrap(there),
+                lambda: jaxcal.cross_validate(there),
             ):
                 with pytest.raises(jaxcal.CalibrationError, match=r"get_context\('spawn'\)"):
                     call()
@@ -177,7 +182,7 @@ def test_a_forked_process_is_told_to_be_spawned():
             os._exit(0)
     os.close(write)
     with open(read) as told:
-        assert told.read() == "told told "
+        assert told.read() == 4 * "told "
     assert os.waitpid(child, 0)[1] == 0
 
 

@@ -39,6 +39,7 @@ from jaxcal.diagnostics.metrics import calibration_reproducibility, reconstruct
 from jaxcal.model.thresholds import MAD
 from jaxcal.model.unknowns import Values, measured, split_further, unknown_names
 from jaxcal.result.calibration import Calibration
+from jaxcal.runtime import executables
 from jaxcal.runtime.array_types import AnyArray
 from jaxcal.runtime.arrays import array_module, each_image, is_traced, map_arrays
 from jaxcal.runtime.given_values import LARGEST_SEED, check_key, check_made, whole_number
@@ -147,6 +148,7 @@ def cross_validate(
     Raises:
         InputError: too few images, folds that are not from 2 to the number of images, options that
             contradict each other, or a result by another method than they ask for.
+        CalibrationError: this process was forked from one in which jaxcal has computed.
     """
     problem, plan, arguments = _one_problem(problem, arguments, "jaxcal.cross_validate")
     count = problem.images
@@ -231,6 +233,7 @@ def bootstrap(
     Raises:
         InputError: fewer than 2 resamples, options that contradict each other, or a result by
             another method than they ask for.
+        CalibrationError: this process was forked from one in which jaxcal has computed.
     """
     problem, plan, arguments = _one_problem(problem, arguments, "jaxcal.bootstrap")
     resamples = whole_number("resamples", resamples, 2, LARGEST_RESAMPLES)
@@ -411,6 +414,7 @@ def _one_problem(
 
     If its values are concrete, every pose counts once.
     """
+    executables.refuse_after_fork()
     problem = as_problem(problem, name)
     if problem.batch_shape:
         raise InputError("resampling takes one problem at a time, not a batch")
