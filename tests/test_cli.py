@@ -8,6 +8,7 @@ import gc
 import io
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -34,6 +35,7 @@ from jaxcal.io.atomic import save_figure
 from jaxcal.io.outputs import begins_with, check_output
 from jaxcal.result.transform import ImageTransform
 from jaxcal.runtime import jax_cache, program_cache
+from jaxcal.runtime.messages import command_line
 from jaxcal.study.simulation import Protocol
 
 FIGURES = ("residuals", "offsets", "accuracy", "influence", "limits")
@@ -610,6 +612,20 @@ def test_a_name_that_the_terminal_cannot_show_loses_no_answer(monkeypatch, encod
     assert run(told, "told") == 0
     expected = {"cp1252": b"\\u03c3", "utf-8": "\N{GREEK SMALL LETTER SIGMA}".encode()}[encoding]
     assert shown.getvalue() == expected + b"\\udcff.h5: 0.2 mm\n"
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["r.h5", r"C:\data\r.h5", "my data.h5", "it's.h5", r"C:\my data" + "\\", "a&b.h5", 'a"b', ""],
+)
+def test_a_command_to_type_is_quoted_for_the_shell(name):
+    words = ["jaxcal", name, "--json"]
+    assert shlex.split(command_line(words, windows=False)) == words
+    # Python's own rule for Windows adds quotes for spaces alone; cmd needs them for others, too.
+    quoted = subprocess.list2cmdline([name])
+    if not quoted.startswith('"') and name not in ("r.h5", r"C:\data\r.h5"):
+        quoted = f'"{quoted}"'
+    assert command_line(words, windows=True) == f"jaxcal {quoted} --json"
 
 
 def test_a_pipe_closed_early_is_no_error(jaxcal_process):

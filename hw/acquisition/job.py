@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shlex
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -29,6 +28,7 @@ from hw.runtime.errors import RefusedError, refused
 from hw.setup.description import Setup, controller_arm
 from jaxcal.io.given_files import naming
 from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.messages import command_line
 
 
 @dataclass(frozen=True)
@@ -173,5 +173,5 @@ def record_confirmed(job: Job, plan: MotionPlan, session: Session, recorder: Rec
 def resume_command(path: str | os.PathLike[str], job: Job) -> str:
     """What to type to go on with a recording."""
     emulated = job.request.bench is not None
-    where = "--bench" if emulated else f"--setup {shlex.quote(job.setup.source)} --move"
-    return f"jaxcal-hw acquire {shlex.quote(os.fspath(path))} --resume {where}"
+    where = ["--bench"] if emulated else ["--setup", job.setup.source, "--move"]
+    return command_line(["jaxcal-hw", "acquire", os.fspath(path), "--resume", *where])

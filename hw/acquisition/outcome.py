@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from typing import TYPE_CHECKING, Any
 
 import h5py
@@ -29,6 +28,7 @@ def calibrate_and_print(path: str, *lines: str) -> dict[str, Any]:
     from jaxcal.report.record import calibration_record
     from jaxcal.report.tables import calibration_table
     from jaxcal.report.verdict import verdict
+    from jaxcal.runtime.messages import command_line
 
     recording, notes = segmented(load(path))
     images = recording.calibration
@@ -37,8 +37,8 @@ def calibrate_and_print(path: str, *lines: str) -> dict[str, Any]:
         result = calibrate(recording, estimate=scale)
     record = calibration_record(result, recording)
     record["warnings"] += notes
-    hint = " --estimate scale" if scale else ""
-    again = f"jaxcal calibrate {shlex.quote(path)}{hint} --report report.html"
+    hint = ["--estimate", "scale"] if scale else []
+    again = command_line(["jaxcal", "calibrate", path, *hint, "--report", "report.html"])
     last = (f"{path}: again, with a report:", Verbatim(f"  {again}"))
     print_page(calibration_table(record), *verdict(record), "", *lines, *last)
     return record

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from pathlib import Path
 
 import click
@@ -18,6 +17,7 @@ def setup(out: str | None) -> int:
     from importlib.resources import files
 
     from jaxcal.io.atomic import write_text
+    from jaxcal.runtime.messages import command_line
 
     text = files("hw.setup").joinpath("example_setup.toml").read_text("utf-8")
     if out is None:
@@ -26,5 +26,6 @@ def setup(out: str | None) -> int:
     if Path(out).exists():
         raise InputError(f"{out}: exists; name another file")
     write_text(out, text)
-    click.echo(f"{out}: written; fill it in, then jaxcal-hw check --setup {shlex.quote(out)}")
+    check = command_line(["jaxcal-hw", "check", "--setup", out])
+    click.echo(f"{out}: written; fill it in, then {check}")
     return ExitCode.CONVERGED

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shlex
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Protocol, runtime_checkable
@@ -18,6 +17,7 @@ from jaxcal.cli.common import ExitCode
 from jaxcal.data.recording import MINIMUM_IMAGES, check_spacing_unit
 from jaxcal.io.frame_names import FramePair
 from jaxcal.io.openigtlink import PORT
+from jaxcal.runtime.messages import command_line
 
 _ENOUGH = 30
 """Default number of images to take."""
@@ -149,7 +149,7 @@ class FreeHandStopped(CalibrationError):
         command = ["jaxcal-hw", "free-hand", f"{asked.host}:{asked.port}", kept, *options]
         super().__init__(
             f"{reason}; {count} of {asked.images} images are in {kept}; go on with: "
-            f"{shlex.join(command)} --resume"
+            f"{command_line([*command, '--resume'])}"
         )
         self.exit_code = ExitCode.INTERRUPTED if interrupted else ExitCode.STOPPED
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shlex
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ import click
 
 from jaxcal.cli.common import ExitCode
 from jaxcal.cli.sequence_options import TABLES, TRACKING, beside, given_options, with_options
-from jaxcal.runtime.messages import counted
+from jaxcal.runtime.messages import command_line, counted
 
 
 @click.command(short_help="Place the target's point in each frame by a click.")
@@ -83,4 +82,4 @@ def _tell(placed: Any, source: str, out: str, options: dict[str, Any]) -> None:
     )
     if count:
         import_them = ["jaxcal", "import", source, out, "OUT.h5", *given_options(options)]
-        click.echo(f"next: {shlex.join(import_them)}")
+        click.echo(f"next: {command_line(import_them)}")

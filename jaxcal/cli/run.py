@@ -57,7 +57,9 @@ def run(commands: click.Group, name: str, arguments: Sequence[str] | None = None
     except OSError as error:
         # A pipe that was closed early (| head) or a full disk; Python would flush once more.
         _drop(sys.stdout)
-        if error.errno == errno.EPIPE:
+        # Of a closed pipe Windows says that the argument is invalid.
+        closed = (errno.EPIPE,) if os.name != "nt" else (errno.EPIPE, errno.EINVAL)
+        if error.errno in closed and error.filename is None:
             return ExitCode.BROKEN_PIPE
         said = _current_folder() or error.strerror or error
         # What files do not take is an error of jaxcal's, above.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 import re
-import shlex
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from jaxcal.cli.common import POSITIVE, Verbatim
+from jaxcal.runtime.messages import command_line
 
 if TYPE_CHECKING:
     from jaxcal.io.target_search import FrameResults
@@ -175,7 +175,7 @@ def by_hand(source: str, found: FrameResults, options: dict[str, Any]) -> list[s
     return [
         "- few show a credible target: check --region and --target, or place the points by "
         f"hand{later}:",
-        Verbatim("  " + shlex.join(["jaxcal", "pick", source, *again])),
+        Verbatim("  " + command_line(["jaxcal", "pick", source, *again])),
     ]
 
 

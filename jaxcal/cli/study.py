@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import sys
 import time
 from collections.abc import Iterator
@@ -13,7 +12,7 @@ import click
 
 from jaxcal import CalibrationError, InputError, MissingExtraError
 from jaxcal.cli.common import Commands, ExitCode, json_option, print_json, print_page
-from jaxcal.runtime.messages import counted
+from jaxcal.runtime.messages import command_line, counted
 
 if TYPE_CHECKING:
     from jaxcal.study.run import Watcher
@@ -113,7 +112,7 @@ def _command(spec: str, out: str, workers: int | None, dask: str | None) -> str:
     parts = ["jaxcal", "study", "run", spec, "--out", out]
     parts += ["--workers", str(workers)] if workers else []
     parts += ["--dask", dask] if dask else []
-    return shlex.join([*parts, "--resume"])
+    return command_line([*parts, "--resume"])
 
 
 class _Bar:

@@ -8,7 +8,6 @@ so.
 
 from __future__ import annotations
 
-import shlex
 from collections import Counter
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -19,6 +18,7 @@ from jaxcal import InputError
 from jaxcal.io.given_files import naming
 from jaxcal.io.sequence import TrackedSequence
 from jaxcal.runtime.array_types import Bool, Float, Int
+from jaxcal.runtime.messages import command_line
 
 FATES = ("found", "not credible", "not tracked", "image not OK")
 FOUND, NOT_CREDIBLE, NOT_TRACKED, IMAGE_NOT_OK = range(4)
@@ -97,7 +97,7 @@ def search_target(
     if sequence.pixels is None:
         raise InputError(
             f"{sequence.source}: holds no pixels: import it with a file of the target's points "
-            f"(jaxcal import {shlex.quote(sequence.source)} POINTS.csv OUT.h5)"
+            f"({command_line(['jaxcal', 'import', sequence.source, 'POINTS.csv', 'OUT.h5'])})"
         )
     count = len(sequence)
     fate = np.where(

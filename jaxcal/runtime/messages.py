@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import re
+from collections.abc import Sequence
+
 
 def quoted(text: str, limit: int = 40) -> str:
     """Text of an untrusted file, short and with control characters escaped, for a message."""
@@ -21,3 +25,23 @@ def counted(count: int, noun: str, one: str = "", several: str = "") -> str:
 def seconds(moment: float) -> str:
     """A time stamp, to the millisecond also where it counts from 1970, for a message."""
     return f"{moment:.3f} s"
+
+
+def command_line(words: Sequence[str], windows: bool = os.name == "nt") -> str:
+    """A command to type, quoted as this system's shell needs it.
+
+    Windows' ``cmd`` takes single quotes for parts of a name; its PowerShell knows double ones, too.
+    """
+    if not windows:
+        import shlex
+
+        return shlex.join(words)
+    return " ".join(map(_quoted_for_windows, words))
+
+
+def _quoted_for_windows(word: str) -> str:
+    if re.fullmatch(r"[\w.:\\/+-]+", word):
+        return word
+    # Programs count a backslash before a quote as an escape of it, and two as one backslash.
+    text = re.sub(r'(\\*)"', r"\1\1\"", word)
+    return '"' + re.sub(r"(\\+)$", r"\1\1", text) + '"'
