@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import errno
 import io
 import logging
@@ -97,8 +98,10 @@ def _print_anything() -> None:
 
     A file's name may hold it, and no answer is to be lost by a name.
     """
-    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
-        sys.stdout.reconfigure(errors="backslashreplace")
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        lacking = codecs.lookup(sys.stdout.encoding).name != "utf-8"
+        if sys.stdout.errors == "strict" or (sys.stdout.errors == "surrogateescape" and lacking):
+            sys.stdout.reconfigure(errors="backslashreplace")
 
 
 def _completion_variable(name: str) -> str:

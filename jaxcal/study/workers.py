@@ -206,7 +206,7 @@ def main() -> None:
     try:
         for line in requests:
             _answer(answers, spec, json.loads(line)["chunk"])
-    except BrokenPipeError:
+    except OSError:  # of the pipes: what a chunk raises is an answer
         # The parent was killed: nobody reads an answer, nor a traceback of what cannot be flushed.
         os._exit(1)
 
