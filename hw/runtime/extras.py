@@ -45,19 +45,19 @@ def missing(name: str, *, extra: Extra) -> str | None:
 
 
 def robot_wheels() -> bool:
-    """Whether ur_rtde publishes wheels for this Python, system and processor.
+    """Whether ur_rtde has wheels for this Python and processor, on a system that moves robots.
 
     The same condition stands at the extra ``robot`` in pyproject.toml.
     """
-    system = sys.platform == "win32" or (sys.platform == "linux" and platform.machine() == "x86_64")
+    system = sys.platform == "linux" and platform.machine() == "x86_64"
     return system and sys.version_info < (3, 13)
 
 
 def _cure(extra: Extra) -> str:
     if extra == "robot" and not robot_wheels():
+        here = f"Python {platform.python_version()} on {platform.system()} {platform.machine()}"
         return (
-            f"ur_rtde has no wheels for Python {platform.python_version()} on {platform.system()} "
-            f'{platform.machine()}, and "jaxcal[robot]" installs nothing here: use CPython 3.11 or '
-            "3.12 on Linux x86-64 or Windows, or build ur_rtde from source"
+            f'"jaxcal[robot]" installs nothing for {here}: robots are moved by ur_rtde and from '
+            "Linux. Use CPython 3.11 or 3.12 on Linux x86-64, or build ur_rtde from source there"
         )
     return f'pip install "jaxcal[{extra}]"'

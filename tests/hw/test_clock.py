@@ -72,9 +72,9 @@ def test_a_missing_extra_is_named(monkeypatch):
         require("rtde_receive_of_nowhere", extra="robot")
     assert caught.value.device == "robot"
     monkeypatch.setattr(extras, "robot_wheels", lambda: False)
-    with pytest.raises(DeviceError, match=r"no wheels for Python .* use CPython 3\.11 or 3\.12"):
+    with pytest.raises(DeviceError, match=r"nothing for Python .* Use CPython 3\.11 or 3\.12"):
         require("rtde_receive_of_nowhere", extra="robot")
-    assert "installs nothing here" in str(missing("rtde_of_nowhere", extra="robot"))
+    assert "installs nothing for" in str(missing("rtde_of_nowhere", extra="robot"))
 
 
 @pytest.mark.parametrize("version", [(3, 11, 7), (3, 12, 1), (3, 13, 0), (3, 14, 0)])
