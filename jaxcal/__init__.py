@@ -12,6 +12,8 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING
 
+from jaxcal.runtime import forks as _forks  # noqa: F401  (it must see every fork)
+
 __version__ = "0.1.0"
 
 
