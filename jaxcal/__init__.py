@@ -12,7 +12,9 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING
 
-from jaxcal.runtime import forks as _forks  # noqa: F401  (it must see every fork)
+# They must see every fork, and every import of JAX.
+from jaxcal.runtime import forks as _forks  # noqa: F401
+from jaxcal.runtime import when_jax as _when_jax  # noqa: F401
 
 __version__ = "0.1.0"
 

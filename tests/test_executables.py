@@ -5,6 +5,7 @@ The functions are tiny; what is tested is files, processes and damage.
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import json
 import logging
@@ -186,6 +187,25 @@ def test_a_forked_process_is_told_to_be_spawned():
     with open(read) as told:
         assert told.read() == 5 * "told "
     assert os.waitpid(child, 0)[1] == 0
+
+
+def interrupted_in_a_collection(x, plan):
+    def ctrl_c(phase, info):
+        gc.callbacks.remove(ctrl_c)
+        signal.raise_signal(signal.SIGINT)
+
+    gc.callbacks.append(ctrl_c)
+    gc.collect()
+    time.sleep(5)
+    return x
+
+
+def test_ctrl_c_in_a_garbage_collection_is_not_lost():
+    """JAX has a callback of the collection, out of which Python raises nothing."""
+    before = sys.unraisablehook
+    with pytest.raises(KeyboardInterrupt):
+        executables.run(interrupted_in_a_collection, (X,), None, flags=FLAGS, label={})
+    assert sys.unraisablehook is before
 
 
 FORKING = """

@@ -47,6 +47,7 @@ from jaxlib import xla_client
 from jaxcal import CalibrationError
 from jaxcal.runtime import compiler, forks, program_cache
 from jaxcal.runtime.arrays import assembled
+from jaxcal.runtime.interrupts import no_interrupt_lost
 
 LOADED = 32
 """Most programs kept in this process; the least recently used is dropped."""
@@ -152,6 +153,7 @@ _being_made: dict[str, Lock] = {}
 _lock = Lock()
 
 
+@no_interrupt_lost()
 def run(
     function: str | Callable[..., Any],
     arguments: tuple[Any, ...],
