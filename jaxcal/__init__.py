@@ -12,6 +12,10 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING
 
+# They must see every fork, and every import of JAX.
+from jaxcal.runtime import forks as _forks  # noqa: F401
+from jaxcal.runtime import when_jax as _when_jax  # noqa: F401
+
 __version__ = "0.1.0"
 
 

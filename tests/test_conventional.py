@@ -181,6 +181,7 @@ assert jax.tree.structure(doubled) == jax.tree.structure(found)
 path, _ = jax.tree_util.tree_leaves_with_path(problem)[0]
 assert jax.tree_util.keystr(path) == ".poses", path
 assert type(jax.jit(lambda p: p)(problem)) is jaxcal.Problem
+import optimistix  # and with it everything that the finder is for
 assert not any(type(finder).__module__.startswith("jaxcal") for finder in sys.meta_path)
 print(json.dumps(said))
 """

@@ -5,6 +5,7 @@ The functions are tiny; what is tested is files, processes and damage.
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import json
 import logging
@@ -174,6 +175,8 @@ def test_a_forked_process_is_told_to_be_spawned():
                 lambda: jaxcal.calibrate_pivot(poses),
                 lambda: jaxcal.bootstrap(there),
                 lambda: jaxcal.cross_validate(there),
+                # JAX would compile it.
+                lambda: jax.jit(jaxcal.calibrate)(there),
             ):
                 with pytest.raises(jaxcal.CalibrationError, match=r"get_context\('spawn'\)"):
                     call()
@@ -182,8 +185,60 @@ def test_a_forked_process_is_told_to_be_spawned():
             os._exit(0)
     os.close(write)
     with open(read) as told:
-        assert told.read() == 4 * "told "
+        assert told.read() == 5 * "told "
     assert os.waitpid(child, 0)[1] == 0
+
+
+def interrupted_in_a_collection(x, plan):
+    def ctrl_c(phase, info):
+        gc.callbacks.remove(ctrl_c)
+        signal.raise_signal(signal.SIGINT)
+
+    gc.callbacks.append(ctrl_c)
+    gc.collect()
+    time.sleep(5)
+    return x
+
+
+def test_ctrl_c_in_a_garbage_collection_is_not_lost():
+    """JAX has a callback of the collection, out of which Python raises nothing."""
+    before = sys.unraisablehook
+    with pytest.raises(KeyboardInterrupt):
+        executables.run(interrupted_in_a_collection, (X,), None, flags=FLAGS, label={})
+    assert sys.unraisablehook is before
+
+
+FORKING = """
+import os, signal, warnings
+import jax, numpy as np
+warnings.simplefilter("ignore")  # JAX's, of the forks
+def twice(x, plan):
+    return 2.0 * x
+def in_a_child():
+    if not os.fork():
+        signal.alarm(30)
+        import jaxcal
+        from jaxcal.runtime import executables
+        try:
+            found = executables.run(twice, (np.ones(1),), None, flags={}, label={})[0]
+        except jaxcal.CalibrationError:
+            found = "told"
+        print(found, flush=True)
+        os._exit(0)
+    os.wait()
+in_a_child()
+jax.devices()
+in_a_child()
+import jaxcal
+in_a_child()
+"""
+"""JAX is only imported; it has started; jaxcal is imported before the fork, too."""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells a fork that came first")
+def test_a_process_forked_from_one_that_used_jax_without_jaxcal_is_told_too():
+    found = subprocess.run([sys.executable, "-c", FORKING], capture_output=True, text=True)
+    assert found.stdout.split() == ["2.0", "told", "told"], found.stderr
 
 
 def other_function(x, plan):

@@ -435,3 +435,34 @@ def test_public_names_are_there_and_listed():
         (jaxcal.backend, jaxcal.backend.__all__),
     ):
         assert all(getattr(module, name) is not None for name in names)
+
+
+INTERRUPTED_IMPORT = """
+import signal, sys, time
+import numpy as np, jaxcal
+class CtrlC:
+    def find_spec(self, name, path=None, target=None):
+        if name == "jax.numpy":
+            sys.meta_path.remove(self)
+            signal.raise_signal(signal.SIGINT)
+poses = np.eye(4)[None]
+handler = signal.getsignal(signal.SIGINT)
+sys.meta_path.insert(0, CtrlC())
+try:
+    try:
+        jaxcal.calibrate_pivot(poses)
+    except jaxcal.InputError:  # too few poses
+        time.sleep(60)
+except KeyboardInterrupt:
+    print("interrupted")
+assert signal.getsignal(signal.SIGINT) is handler
+try:
+    jaxcal.calibrate_pivot(poses)
+except jaxcal.InputError:
+    print("answers")
+"""
+
+
+def test_ctrl_c_while_jax_is_imported_comes_and_leaves_jax_whole(tmp_path):
+    """JAX's modules that stayed were no part of the next JAX, for the rest of the process."""
+    assert run_fresh(INTERRUPTED_IMPORT, tmp_path).split() == ["interrupted", "answers"]

@@ -49,6 +49,7 @@ FEW_PROBLEMS = 1024
 @in_own_modes
 def solve_problem(problem: Problem, given: Given, plan: SolvePlan) -> Calibration:
     """Solve one problem; the result does not hold the problem (traceable)."""
+    executables.refuse_after_fork()  # what JAX compiles waits without end as well
     if _is_kept(problem, plan, inside=inside_transformation(problem, given)):
         return _solve_kept(problem, given, plan)
     return _solve_compiled(problem, given, plan)
@@ -97,6 +98,7 @@ def solve_batch(problems: Problem, given: Given, plan: SolvePlan, chunk: int | N
         plan: what is static about it.
         chunk: number of problems solved side by side; None: what suits the data and the device.
     """
+    executables.refuse_after_fork()
     shape = problems.batch_shape
     flat = problems
     if len(shape) > 1:

@@ -206,7 +206,7 @@ def calibrate_pivot(
         InputError: poses or a mask of another shape, or what are no numbers; concrete poses, not
             of a batch, that are not rigid transforms or look like metres, or fewer than 4 used
             ones.
-        CalibrationError: this process was forked from one in which jaxcal has computed.
+        CalibrationError: this process was forked from one in which JAX had started.
     """
     check_flag("robust", robust)
     executables.refuse_after_fork()

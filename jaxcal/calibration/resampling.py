@@ -148,7 +148,7 @@ def cross_validate(
     Raises:
         InputError: too few images, folds that are not from 2 to the number of images, options that
             contradict each other, or a result by another method than they ask for.
-        CalibrationError: this process was forked from one in which jaxcal has computed.
+        CalibrationError: this process was forked from one in which JAX had started.
     """
     problem, plan, arguments = _one_problem(problem, arguments, "jaxcal.cross_validate")
     count = problem.images
@@ -233,7 +233,7 @@ def bootstrap(
     Raises:
         InputError: fewer than 2 resamples, options that contradict each other, or a result by
             another method than they ask for.
-        CalibrationError: this process was forked from one in which jaxcal has computed.
+        CalibrationError: this process was forked from one in which JAX had started.
     """
     problem, plan, arguments = _one_problem(problem, arguments, "jaxcal.bootstrap")
     resamples = whole_number("resamples", resamples, 2, LARGEST_RESAMPLES)

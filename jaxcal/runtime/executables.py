@@ -45,8 +45,9 @@ import numpy as np
 from jaxlib import xla_client
 
 from jaxcal import CalibrationError
-from jaxcal.runtime import compiler, program_cache
+from jaxcal.runtime import compiler, forks, program_cache
 from jaxcal.runtime.arrays import assembled
+from jaxcal.runtime.interrupts import no_interrupt_lost
 
 LOADED = 32
 """Most programs kept in this process; the least recently used is dropped."""
@@ -147,14 +148,12 @@ def in_numpy(arrays: list[jax.Array]) -> list[np.ndarray]:
     return [np.asarray(array) for array in arrays]
 
 
-_computing: int | None = None
-"""The process that ran the first program: JAX's threads are in it, and in none forked from it."""
-
 _loaded: OrderedDict[str, _Program] = OrderedDict()
 _being_made: dict[str, Lock] = {}
 _lock = Lock()
 
 
+@no_interrupt_lost()
 def run(
     function: str | Callable[..., Any],
     arguments: tuple[Any, ...],
@@ -180,7 +179,7 @@ def run(
 
     Raises:
         NotDescribableError: arguments or plan hold what cannot be described.
-        CalibrationError: this process was forked from one that has run a program.
+        CalibrationError: this process was forked from one in which JAX had started.
     """
     refuse_after_fork()
     leaves: list[Any] = []
@@ -234,13 +233,11 @@ def refuse_after_fork() -> None:
     """Refuse to compute where it would wait without end for threads that a fork left behind.
 
     Raises:
-        CalibrationError: this process was forked from one that has run a program.
+        CalibrationError: this process was forked from one in which JAX had started.
     """
-    global _computing
-    _computing = _computing or os.getpid()
-    if _computing != os.getpid():
+    if forks.are_threads_left_behind():
         raise CalibrationError(
-            "jaxcal cannot compute in a process that was forked from one in which it has computed: "
+            "jaxcal cannot compute in a process that was forked from one in which JAX had started: "
             "JAX's threads are not in it. Start processes by 'spawn', as by "
             "multiprocessing.get_context('spawn')"
         )
