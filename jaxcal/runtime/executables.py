@@ -153,7 +153,6 @@ _being_made: dict[str, Lock] = {}
 _lock = Lock()
 
 
-@no_interrupt_lost()
 def run(
     function: str | Callable[..., Any],
     arguments: tuple[Any, ...],
@@ -235,7 +234,7 @@ def refuse_after_fork() -> None:
     Raises:
         CalibrationError: this process was forked from one in which JAX had started.
     """
-    if forks.are_threads_left_behind():
+    if forks.threads_left_behind:
         raise CalibrationError(
             "jaxcal cannot compute in a process that was forked from one in which JAX had started: "
             "JAX's threads are not in it. Start processes by 'spawn', as by "
@@ -286,6 +285,7 @@ def _load(key: str, device: Any) -> _Program | None:
         return None
 
 
+@no_interrupt_lost()
 def _compile(
     function: Callable[[list[Any]], Any],
     leaves: list[Any],

@@ -26,17 +26,13 @@ def _is_one_thread() -> bool:
 
 
 # jaxcal may be imported after the fork only. JAX that has started has threads of its own.
-_left_behind = _jax_has_started() and _is_one_thread()
-
-
-def are_threads_left_behind() -> bool:
-    """Whether this process was forked from one in which JAX had started."""
-    return _left_behind
+threads_left_behind = _jax_has_started() and _is_one_thread()
+"""Whether this process was forked from one in which JAX had started."""
 
 
 def _note() -> None:
-    global _left_behind
-    _left_behind = _left_behind or _jax_has_started()
+    global threads_left_behind
+    threads_left_behind = threads_left_behind or _jax_has_started()
 
 
 if hasattr(os, "register_at_fork"):
