@@ -54,7 +54,9 @@ def apply(
 
     SOURCE is a table with columns u and v, and a pose (probe to tracker) if points in the tracker's
     frame are wanted; or a recording (.h5). Standard deviations and covariances include those of the
-    calibration (with estimated pixel sizes) and of --pixel-sd, but not those of the pose. Masked
+    calibration (with estimated pixel sizes) and of --pixel-sd, but not those of the pose. They are
+    what the calibration's covariance says: where the verdict contradicts it, expect more, by the
+    factor that the verdict tells (tre.factor in CAL). Masked
     images of a recording are left out; a last column, image, has the numbers of the others. With
     --skip-invalid a last column, line, says which row is which.
     """

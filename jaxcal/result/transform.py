@@ -236,7 +236,8 @@ class ImageTransform:
         Returns:
             Points and covariances. The covariances include the calibration's (also that of
             estimated pixel sizes, sound speed and delay) and the points' own, but not the pose's,
-            and not the factor for tuned SDs that :func:`jaxcal.predicted_tre` has.
+            and neither the factor for tuned SDs that :func:`jaxcal.predicted_tre` has, nor that by
+            which the verdict finds the covariance too small.
 
         Raises:
             InputError: shapes that do not agree, NaN or numbers over 1e9, a negative SD, or a pose
