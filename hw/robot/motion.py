@@ -144,7 +144,13 @@ class Motion:
             with self._sending:
                 # The setup must come first: a stop that is asked for now waits until it is sent.
                 self._process = spawn("hw.robot.mover", stdin=True)
+                # A long setup fills the pipe: if the process does not read it, the write would
+                # wait without end. Before it has read all of it, it has not connected.
+                unread = threading.Timer(_START_PATIENCE_S, self._process.kill)
+                unread.daemon = True
+                unread.start()
                 self._write(setup)
+                unread.cancel()
             self._thread = threading.Thread(target=self._receive, name="motion", daemon=True)
             self._thread.start()
             deadline = time.monotonic() + _START_PATIENCE_S

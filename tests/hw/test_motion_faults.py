@@ -9,10 +9,12 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -471,3 +473,30 @@ def test_a_caller_that_was_stopped_itself_blames_nobody(monkeypatch):
     motion._answers, motion._heard = Stopped(), time.monotonic()
     with pytest.raises(StaleError, match="silent"):
         motion._wait(1)
+
+
+def test_a_process_that_does_not_read_a_long_setup_does_not_hold_up_the_start(monkeypatch) -> None:
+    monkeypatch.setattr("hw.robot.motion._START_PATIENCE_S", 1.0)
+    plan = replace(PLAN, targets=np.repeat(HOME[None], 2000, axis=0))
+    motion = Motion("127.0.0.1", plan, None)
+    errors: list[BaseException] = []
+
+    def start() -> None:
+        try:
+            motion.start()
+        except DeviceError as error:
+            errors.append(error)
+
+    thread = threading.Thread(target=start, daemon=True)
+    thread.start()
+    while motion._process is None:
+        time.sleep(0.001)
+    process = motion._process
+    os.kill(process.pid, signal.SIGSTOP)
+    try:
+        thread.join(5.0)
+        assert not thread.is_alive()
+        assert [type(error) for error in errors] == [LostError]
+    finally:
+        process.kill()
+        thread.join()
