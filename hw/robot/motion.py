@@ -149,8 +149,10 @@ class Motion:
                 unread = threading.Timer(_START_PATIENCE_S, self._process.kill)
                 unread.daemon = True
                 unread.start()
-                self._write(setup)
-                unread.cancel()
+                try:
+                    self._write(setup)
+                finally:
+                    unread.cancel()
             self._thread = threading.Thread(target=self._receive, name="motion", daemon=True)
             self._thread.start()
             deadline = time.monotonic() + _START_PATIENCE_S
