@@ -223,3 +223,65 @@ def test_jax_is_imported_before_its_parts():
             if not whole and any(name.startswith("jax.") for name in names):
                 early.append(f"{path.relative_to(HOME)}:{node.lineno}")
     assert not early
+
+
+LINUX_ONLY = ("hw.robot.mover", "hw.robot.motion", "hw.bench")
+"""What moves a robot, and the emulated bench with its pseudo-terminals."""
+
+NOT_ON_WINDOWS = {
+    "os": (
+        "fork forkpty openpty ttyname mkfifo mknod kill killpg getpgid getpgrp setsid statvfs "
+        "fstatvfs pread pwrite posix_fallocate posix_fadvise posix_spawn getuid geteuid getgid "
+        "getegid fchmod fchown chown wait3 wait4 WIFEXITED WEXITSTATUS sched_setaffinity "
+        "sched_getaffinity sched_setscheduler sched_param SCHED_FIFO SCHED_OTHER getloadavg nice "
+        "uname sync fdatasync sendfile tcgetpgrp tcsetpgrp O_DIRECTORY O_NOFOLLOW O_CLOEXEC "
+        "O_NONBLOCK register_at_fork memfd_create"
+    ),
+    "signal": (
+        "SIGKILL SIGHUP SIGSTOP SIGCONT SIGTSTP SIGALRM SIGUSR1 SIGUSR2 SIGCHLD SIGPIPE SIGQUIT "
+        "pthread_kill pthread_sigmask sigwait sigtimedwait sigpending setitimer alarm pause "
+        "siginterrupt"
+    ),
+    "select": "poll epoll",
+}
+MODULES_NOT_ON_WINDOWS = {"fcntl", "resource", "termios", "tty", "pty", "pwd", "grp"}
+
+
+def unguarded(source: str) -> list[str]:
+    """Names that Windows lacks where nothing asks whether they are there."""
+    found: list[str] = []
+
+    def visit(node: ast.AST, guarded: bool) -> None:
+        if isinstance(node, ast.If | ast.IfExp | ast.While | ast.BoolOp):
+            asked = ast.unparse(node if isinstance(node, ast.BoolOp) else node.test)
+            guarded |= any(text in asked for text in ("hasattr(", "os.name", "sys.platform"))
+        elif isinstance(node, ast.Try):
+            caught = " ".join(ast.unparse(each.type) for each in node.handlers if each.type)
+            guarded |= "AttributeError" in caught or "ImportError" in caught
+        elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+            if not guarded and node.attr in NOT_ON_WINDOWS.get(node.value.id, "").split():
+                found.append(ast.unparse(node))
+        elif isinstance(node, ast.Import | ast.ImportFrom) and not guarded:
+            names = {each.name for each in node.names} | {getattr(node, "module", None)}
+            found.extend(sorted(names & MODULES_NOT_ON_WINDOWS))
+        for child in ast.iter_child_nodes(node):
+            visit(child, guarded)
+
+    visit(ast.parse(source), False)
+    return found
+
+
+def test_what_windows_lacks_is_asked_for():
+    """Nobody runs these tests there: a recording of the bench once failed at every flush."""
+    wrong = "import fcntl\nif ready:\n    os.fstatvfs(1)\nhasattr(os, 'nice') and os.nice(1)"
+    assert unguarded(wrong) == ["fcntl", "os.fstatvfs"]
+    found = {
+        name: names
+        for name, path in sources().items()
+        if not name.startswith(LINUX_ONLY) and (names := unguarded(path.read_text("utf-8")))
+    }
+    # Who calls these asks first: a POSIX terminal, and a worker that watches its parent.
+    assert found == {
+        "hw.runtime.keys": ["tty", "termios", "os.tcgetpgrp", "os.getpgrp"],
+        "jaxcal.study.workers": ["select.poll"],
+    }

@@ -213,8 +213,9 @@ class RecordingWriter:
         self._file.flush()
         if durable:
             os.fsync(self._descriptor)
-        disk = os.fstatvfs(self._descriptor)
-        if disk.f_bavail * disk.f_frsize < self.reserve_bytes:
+        # The file may have been moved by now; Windows asks by a path, and lets nobody move it.
+        place = self.path if os.name == "nt" else self._descriptor
+        if shutil.disk_usage(place).free < self.reserve_bytes:
             self.close()
             raise OutputError(f"{self.path}: the disk is nearly full: free some space")
         # HDF5 has cut the file to its own length, so the bytes allocated ahead are gone.
@@ -289,13 +290,21 @@ class RecordingWriter:
         """Make a file whose last flush failed open again: match its length and its superblock's."""
         with suppress(OSError):
             size = os.fstat(self._descriptor).st_size
-            start = os.pread(self._descriptor, _END_OF_FILE.stop, 0)
-            if start[8] != 0 or int.from_bytes(start[_END_OF_FILE], "little") <= size:
-                return
+            # Windows cannot read at a place without going there, and HDF5 counts on where it was.
+            before = os.lseek(self._descriptor, 0, os.SEEK_CUR)
             try:
-                os.ftruncate(self._descriptor, int.from_bytes(start[_END_OF_FILE], "little"))
-            except OSError:
-                os.pwrite(self._descriptor, size.to_bytes(8, "little"), _END_OF_FILE.start)
+                os.lseek(self._descriptor, 0, os.SEEK_SET)
+                start = os.read(self._descriptor, _END_OF_FILE.stop)
+                length = int.from_bytes(start[_END_OF_FILE], "little")
+                if start[8] != 0 or length <= size:
+                    return
+                try:
+                    os.ftruncate(self._descriptor, length)
+                except OSError:
+                    os.lseek(self._descriptor, _END_OF_FILE.start, os.SEEK_SET)
+                    os.write(self._descriptor, size.to_bytes(8, "little"))
+            finally:
+                os.lseek(self._descriptor, before, os.SEEK_SET)
 
     def _check_place(self) -> None:
         """Check that the path still leads to the file that is being written.
