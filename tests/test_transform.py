@@ -74,7 +74,7 @@ def test_plus_matrix_is_jaxcals_model(seed):
     "extension", ["json", "xml", "tfm", "txt", "h5", "yaml", "csv", "npy", "npz"]
 )
 def test_saved_and_loaded(tmp_path, extension):
-    known = random_transform()
+    known = replace(random_transform(), tre_factor=1.5)
     path = tmp_path / f"cal.{extension}"
     known.save(path)
     if extension == "xml":
@@ -90,7 +90,7 @@ def test_saved_and_loaded(tmp_path, extension):
     )
     if extension in ("json", "npz"):
         np.testing.assert_array_equal(found.covariance, known.covariance)
-        assert found.face_offset_mm == 1.5
+        assert (found.face_offset_mm, found.tre_factor) == (1.5, 1.5)
     if extension == "json":
         assert (found.error_mm, found.converged) == (0.7, True)
     if extension == "xml":
@@ -558,6 +558,8 @@ def good_record():
         ),
         ({"scale_mm_per_px": [np.nan, np.nan]}, "scale_mm_per_px holds NaN or Inf"),
         ({"range_factor": np.inf}, "range_factor holds NaN or Inf"),
+        ({"tre": {"factor": 0}}, "tre_factor must be positive"),
+        ({"tre": {"factor": "x"}}, "factor must be numbers"),
         ({"converged": "false"}, "converged must be true, false or null"),
         ({"converged": 0}, "converged must be true, false or null"),
         ({"version": -1}, "is version '-1'"),
@@ -750,6 +752,20 @@ def test_apply_to_a_table(saved, tmp_path, capsys):
     (tmp_path / "p.csv").write_text("lateral,range\n1,2\n")
     assert main(["apply", str(saved), str(tmp_path / "p.csv")]) == 2
     assert "the calibration takes pixels" in capsys.readouterr().err
+
+
+def test_apply_tells_that_the_verdict_expects_more_than_the_covariance_says(tmp_path, capsys):
+    recording = jaxcal.simulate_recording(jaxcal.Protocol(images=40), seed=3)
+    points = np.array(recording.calibration.measurements)
+    points[7, 0] += 12.0  # of another target
+    images = replace(recording.calibration, measurements=points)
+    result = jaxcal.calibrate(replace(recording, calibration=images))
+    factor = result.record()["tre"]["factor"]
+    assert factor > 1
+    result.save(tmp_path / "c.json")
+    assert main(["apply", str(tmp_path / "c.json"), "--pixel", "1", "40"]) == 0
+    assert f"its verdict expects errors {factor:.1f} times as large" in capsys.readouterr().err
+    assert f"{factor:.1f} times as large" in repr(load_calibration(tmp_path / "c.json"))
 
 
 def test_apply_refuses_options_of_a_table_where_none_is_read(saved, tmp_path, capsys):

@@ -55,8 +55,8 @@ def apply(
     SOURCE is a table with columns u and v, and a pose (probe to tracker) if points in the tracker's
     frame are wanted; or a recording (.h5). Standard deviations and covariances include those of the
     calibration (with estimated pixel sizes) and of --pixel-sd, but not those of the pose. They are
-    what the calibration's covariance says: where the verdict contradicts it, expect more, by the
-    factor that the verdict tells (tre.factor in CAL). Masked
+    what the calibration's covariance says; if its verdict expects larger errors, the factor is told
+    on standard error. Masked
     images of a recording are left out; a last column, image, has the numbers of the others. With
     --skip-invalid a last column, line, says which row is which.
     """
@@ -91,6 +91,12 @@ def apply(
     elif transform.scale_mm_per_px is None:
         click.echo(
             f"{calibration}: knows no pixel size, so --pixel takes points in mm: lateral, range",
+            err=True,
+        )
+    if transform.tre_factor > 1:
+        click.echo(
+            f"- {calibration}: its verdict expects errors {transform.tre_factor:.1f} times as "
+            "large as these SDs of the calibration say",
             err=True,
         )
     applied = transform.apply(points, poses, pixel_sd_px=pixel_sd)

@@ -139,6 +139,7 @@ def save(
                 known = {key: value for key, value in _record(transform).items() if key in _NPZ}
                 matrix = None if transform.scale_mm_per_px is None else transform.plus_matrix()
                 known |= {"plus_image_to_probe": matrix, "probe_frame": transform.probe_frame}
+                known |= {"tre_factor": transform.tre_factor}
                 np.savez(file, **{k: v for k, v in known.items() if v is not None})
             else:
                 np.save(file, transform.plus_matrix())
@@ -248,6 +249,7 @@ def _record(transform: ImageTransform) -> dict[str, Any]:
         "converged": transform.converged,
         **{k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in arrays.items()},
         "rms_mm": transform.error_mm,
+        "tre": None if transform.tre_factor == 1 else {"factor": transform.tre_factor},
         "pose_frames": None if probe == "Probe" else {"from": probe, "to": None},
         "date": transform.date,
         "jaxcal_version": __version__,
@@ -371,6 +373,8 @@ def _load_npz(path: str | os.PathLike[str]) -> ImageTransform:
             record = {name: file[name].tolist() for name in _NPZ if name in file.files}
             if "probe_frame" in file.files:
                 record["pose_frames"] = {"from": file["probe_frame"].tolist()}
+            if "tre_factor" in file.files:
+                record["tre"] = {"factor": file["tre_factor"].tolist()}
     except FormatError:
         raise
     except Exception as error:
@@ -419,6 +423,8 @@ def transform_from_record(record: dict[str, Any], *, source: str = "memory") -> 
     offset = _array(record, "face_offset_mm", ())
     factor = _array(record, "range_factor", ())
     error = _array(record, "rms_mm", ())
+    tre = record.get("tre")
+    times = _array(tre, "factor", ()) if isinstance(tre, dict) else None
     date, frames = record.get("date"), record.get("pose_frames")
     named = frames.get("from") if isinstance(frames, dict) else None
     if not (date is None or isinstance(date, str)):
@@ -439,6 +445,7 @@ def transform_from_record(record: dict[str, Any], *, source: str = "memory") -> 
         _array(record, "image_covariance", (size, size)),
         date,
         named if isinstance(named, str) else "Probe",
+        1.0 if times is None else float(times),
     )
 
 

@@ -77,6 +77,8 @@ class ImageTransform:
         date: when the calibration was made, ISO 8601 with its time zone; None if unknown.
         probe_frame: name of the probe's frame, for programs that name frames; ``Probe`` is written
             for a name that PLUS refuses.
+        tre_factor: how many times larger than the covariance says the calibration's verdict expects
+            the errors of image points to be; 1 where no verdict is known.
 
     Raises:
         InputError: wrong shapes, ``unknowns`` or ``date``; and, unless ``converged`` is False, NaN
@@ -96,6 +98,7 @@ class ImageTransform:
     image_covariance: Float[np.ndarray, "q q"] | None = None
     date: str | None = None
     probe_frame: str = "Probe"
+    tre_factor: float = 1.0
 
     def __post_init__(self) -> None:
         moving = [name for name in TABLE if TABLE[name].in_image]
@@ -108,6 +111,7 @@ class ImageTransform:
             "scale_mm_per_px": (2,),
             "face_offset_mm": (),
             "range_factor": (),
+            "tre_factor": (),
             "covariance": (6, 6),
             "image_covariance": (size, size),
             "error_mm": (),
@@ -144,6 +148,8 @@ class ImageTransform:
             along = ", ".join(f"{each:.3g}" for each in sd[:3])
             about = ", ".join(f"{each:.3g}" for each in np.degrees(sd[3:]))
             lines.append(f"SDs along and about the image's axes: {along} mm; {about} deg")
+        if self.tre_factor > 1:
+            lines.append(f"errors expected by its verdict: {self.tre_factor:.1f} times as large")
         if self.converged is False:
             lines.append("must not be used")
         return "\n".join(lines)
@@ -236,8 +242,8 @@ class ImageTransform:
         Returns:
             Points and covariances. The covariances include the calibration's (also that of
             estimated pixel sizes, sound speed and delay) and the points' own, but not the pose's,
-            and neither the factor for tuned SDs that :func:`jaxcal.predicted_tre` has, nor that by
-            which the verdict finds the covariance too small.
+            and neither the factor for tuned SDs that :func:`jaxcal.predicted_tre` has, nor the
+            verdict's (``tre_factor``).
 
         Raises:
             InputError: shapes that do not agree, NaN or numbers over 1e9, a negative SD, or a pose
@@ -382,7 +388,7 @@ def _checked(values: dict[str, np.ndarray]) -> Float[np.ndarray, "4 4"]:
     for name, array in values.items():
         if name not in ("image_plane_to_probe", "error_mm") and not np.isfinite(array).all():
             raise InputError(f"{name} holds NaN or Inf")
-        if name in ("scale_mm_per_px", "range_factor") and not (array > 0).all():
+        if name in ("scale_mm_per_px", "range_factor", "tre_factor") and not (array > 0).all():
             raise InputError(f"{name} must be positive")
         if name in ("covariance", "image_covariance") and (np.diag(array) < 0).any():
             raise InputError(f"{name} holds a negative variance")
