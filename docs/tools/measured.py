@@ -27,7 +27,7 @@ SETTINGS: dict[str, tuple[str, ...]] = {
         "about 30 images with",
         "tilted by 20 to 30 degrees",
         "expect up to 0.5 mm, up to 1.5 mm of error in the image",
-        "Python 3.11 or newer",
+        "Python 3.11 to 3.14",
         "BSD 3-clause",
     ),
     INDEX: ("from 22 to 26 November 2026", "a machine with 16 cores", "some with only 8 images"),
