@@ -17,7 +17,7 @@ repetitions begin at k = 500,000. Offsets of zero have no law: that row of the g
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +34,7 @@ from common import (
     machine,
     paired_ratio,
     precision,
+    problems_of,
     save_figure,
     write_rows,
 )
@@ -159,8 +160,8 @@ def run_cell(cell: Cell, indices: Array, *, with_hindsight: bool = True) -> dict
         images=cell.images, elevation_distribution=cell.law, elevation_mm=size, noise_mm=noise
     )
     drawn = experiments(SEED, indices, protocol)
-    plain = jax.vmap(lambda experiment: experiment.problem())(drawn)
-    weighted = replace(plain, covariance=drawn.covariance)
+    plain = problems_of(drawn, covariances=False)
+    weighted = problems_of(drawn, covariances=True)
     results = {
         "conventional": calibrate_batch(plain, "conventional"),
         "alternating": calibrate_batch(plain, "alternating"),

@@ -25,10 +25,8 @@ from __future__ import annotations
 
 import itertools
 import time
-from dataclasses import replace
 from pathlib import Path
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from bayes_sampler import Mean, posterior_mean
@@ -41,6 +39,7 @@ from common import (
     machine,
     paired_ratio,
     precision,
+    problems_of,
     save_figure,
     show,
     write_table,
@@ -102,11 +101,11 @@ def run_cell(
 ) -> list[object]:
     """One row of the table."""
     drawn = draw(law, images, indices, elevation, noise)
-    plain = jax.vmap(lambda experiment: experiment.problem())(drawn)
+    plain = problems_of(drawn, covariances=False)
     results = {
         "conventional": calibrate_batch(plain, "conventional", chunk=50),
         "gaussian": calibrate_batch(plain, "joint", "gaussian", chunk=50),
-        "auto": calibrate_batch(replace(plain, covariance=drawn.covariance), "joint", chunk=50),
+        "auto": calibrate_batch(problems_of(drawn, covariances=True), "joint", chunk=50),
     }
     found = limits(law, elevation, drawn, results["auto"], indices)
     answers = {name: result.image_to_probe for name, result in results.items()}

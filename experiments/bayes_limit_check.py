@@ -12,14 +12,13 @@ Seed 20261127; the trials are fold_in(root, condition * 10^6 + k) of ``bayes_lim
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 
 import bayes_limit
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import arguments, machine, precision, show, write_table
+from common import arguments, machine, precision, problems_of, show, write_table
 from jaxtyping import Array
 
 from jaxcal.backend import RIGID, Parameters, measurement_residual, retract
@@ -111,8 +110,7 @@ def run(condition: int, trials: int, steps: int) -> list[object]:
     law, images = CONDITIONS[condition]
     indices = 1_000_000_000 + condition * 1_000_000 + jnp.arange(trials)
     experiments = bayes_limit.draw(law, images, indices, SIZE_MM, NOISE_MM)
-    problems = jax.vmap(lambda experiment: experiment.problem())(experiments)
-    problems = replace(problems, covariance=experiments.covariance)
+    problems = problems_of(experiments, covariances=True)
     # Both begin at the truth: a walk must, for there every offset is within the edges.
     found = bayes_limit.limits(law, SIZE_MM, experiments, experiments, indices)
     starts = jax.vmap(lambda x, c: Parameters.of(x[:3, :3], x[:3, 3], c))(

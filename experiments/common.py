@@ -117,6 +117,19 @@ def _experiments(
     return jax.vmap(lambda k: simulate(jax.random.fold_in(root, k), protocol))(indices)
 
 
+def problems_of(drawn: Experiment, *, covariances: bool) -> Problem:
+    """The problems of a batch of experiments.
+
+    Args:
+        drawn: by :func:`experiments`.
+        covariances: with those of the points; without noise these are zero, and are left away.
+    """
+    problems = jax.vmap(lambda experiment: experiment.problem())(drawn)
+    if covariances and np.any(np.asarray(drawn.covariance)):
+        return replace(problems, covariance=drawn.covariance)
+    return problems
+
+
 def precision(
     x: Float[Array | np.ndarray, "t 4 4"],
     poses: Float[Array | np.ndarray, "t n 4 4"],

@@ -13,16 +13,15 @@ Seed 20261125; trial k of a condition is fold_in(root, condition * 10^6 + k).
 from __future__ import annotations
 
 import itertools
-from dataclasses import replace
 from pathlib import Path
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from common import (
     arguments,
     experiments,
     machine,
+    problems_of,
     right_errors,
     save_figure,
     write_table,
@@ -71,8 +70,7 @@ def main() -> None:
             noise_mm=noise,
         )  # fmt: skip
         drawn = experiments(SEED, indices, protocol)
-        plain = jax.vmap(lambda experiment: experiment.problem())(drawn)
-        problems = replace(plain, covariance=drawn.covariance)
+        problems = problems_of(drawn, covariances=True)
         for method, rows in tables.items():
             result = calibrate_batch(problems, method, chunk=50)
             found, truth = np.asarray(result.image_to_probe), np.asarray(drawn.image_to_probe)

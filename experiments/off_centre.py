@@ -16,10 +16,17 @@ from __future__ import annotations
 import itertools
 from dataclasses import replace
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from common import arguments, experiments, machine, right_errors, save_figure, write_rows
+from common import (
+    arguments,
+    experiments,
+    machine,
+    problems_of,
+    right_errors,
+    save_figure,
+    write_rows,
+)
 from matplotlib.figure import Figure
 
 from jaxcal import Protocol, calibrate_batch, transform_intervals
@@ -87,8 +94,7 @@ def main() -> None:
         centred = experiments(SEED, condition * 1_000_000 + jnp.arange(trials), protocol)
         for mean in MEANS_MM:
             drawn = moved(centred, mean)
-            plain = jax.vmap(lambda experiment: experiment.problem())(drawn)
-            result = calibrate_batch(replace(plain, covariance=drawn.covariance), chunk=50)
+            result = calibrate_batch(problems_of(drawn, covariances=True), chunk=50)
             assert result.offset_law is not None
             found, truth = np.asarray(result.image_to_probe), np.asarray(drawn.image_to_probe)
             off, half = right_errors(found, truth), np.asarray(transform_intervals(result))

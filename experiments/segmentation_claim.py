@@ -61,7 +61,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import arguments, machine, save_figure, write_table
+from common import arguments, machine, problems_of, save_figure, write_table
 from jaxtyping import Float
 
 from jaxcal import Problem, Protocol, calibrate_batch, reconstruction_precision, simulate
@@ -184,7 +184,7 @@ def run_elevation(elevation: float, trials: int, seen: dict[float, np.ndarray]) 
 
     experiments = draw(jnp.arange(trials))
     exact = np.asarray(experiments.points)
-    template: Problem = jax.vmap(lambda experiment: experiment.problem())(experiments)
+    template: Problem = problems_of(experiments, covariances=False)
     test = np.asarray(experiments.test_points)
     picks = np.random.default_rng([SEED, 2]).normal(size=test.shape) * np.array(PICKED_MM)
     tests = {"exact": jnp.asarray(test), "picked": jnp.asarray(test + picks)}

@@ -21,6 +21,7 @@ from common import (
     grid_panel,
     machine,
     precision,
+    problems_of,
     save_figure,
     write_table,
 )
@@ -36,7 +37,7 @@ def run_cell(cell: int, elevation: float, noise: float, trials: int) -> dict[str
     """All trials of one cell: RP of every method, estimated and realised SDs (mm)."""
     indices = cell * 1_000_000 + jnp.arange(trials)
     drawn = experiments(SEED, indices, Protocol(elevation_mm=elevation, noise_mm=noise))
-    problems = jax.vmap(lambda experiment: experiment.problem())(drawn)
+    problems = problems_of(drawn, covariances=False)
     results = {
         "conventional": calibrate_batch(problems, method="conventional"),
         "alternating": calibrate_batch(problems, method="alternating"),

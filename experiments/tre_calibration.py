@@ -30,7 +30,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import LAWS, arguments, experiments, machine, save_figure, write_table
+from common import LAWS, arguments, experiments, machine, problems_of, save_figure, write_table
 
 from jaxcal import Calibration, Problem, Protocol, calibrate_batch, predicted_tre
 from jaxcal.data.probe import L14_5
@@ -130,8 +130,7 @@ def laws(trials: int, folder: Path) -> list[list[object]]:
             images=40, test_images=2, elevation_distribution=law, elevation_mm=size, noise_mm=0.5
         )
         drawn = experiments(SEED, indices, protocol)
-        plain = jax.vmap(lambda experiment: experiment.problem())(drawn)
-        result = calibrate_batch(replace(plain, covariance=drawn.covariance))
+        result = calibrate_batch(problems_of(drawn, covariances=True))
         actual = actual_errors(result, np.asarray(drawn.image_to_probe), POINTS_MM)
         stated = tre_at(result, POINTS_MM)
         whole, over = tre_over(result, POINTS_MM), np.sqrt(np.mean(actual**2, axis=1))
