@@ -160,6 +160,8 @@ def test_threads_wait_for_the_one_that_compiles():
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="this platform does not fork")
+# Python 3.12 and newer warns where an earlier test has left threads.
+@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
 def test_a_forked_process_is_told_to_be_spawned():
     """It waited without end for JAX's threads, which are in its parent alone."""
     check(executables.run(scaled, (X,), FACTOR, flags=FLAGS, label={}))

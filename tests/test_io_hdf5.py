@@ -523,6 +523,31 @@ def test_variable_length_enum_and_array_types(path):
         refused(path, "/calibration/point has type .*, numbers are needed")
 
 
+@pytest.mark.parametrize("where", ["dataset", "attribute"])
+@pytest.mark.parametrize("damage", ["exponent", "size of the exponent"])
+def test_numbers_that_numpy_does_not_have(path, where, damage):
+    """Damaged descriptions of numbers end the process in a build of HDF5 with assertions."""
+    kind = h5py.h5t.IEEE_F64LE.copy()
+    if damage == "exponent":
+        kind.set_ebias(1000)
+    else:
+        kind.set_fields(63, 50, 11, 0, 50)
+    with h5py.File(path, "r+") as file:
+        images = file["calibration"]
+        if where == "dataset":
+            space = h5py.h5s.create_simple((COUNT, 4, 4))
+            values = images.pop("pose")[()]
+            made = h5py.h5d.create(images.id, b"pose", kind, space)
+            made.write(h5py.h5s.ALL, h5py.h5s.ALL, values)
+        else:
+            value = np.array(images.attrs.pop("face_offset_mm", 0.0))
+            made = h5py.h5a.create(
+                images.id, b"face_offset_mm", kind, h5py.h5s.create(h5py.h5s.SCALAR)
+            )
+            made.write(value)
+    refused(path, "/calibration.* holds numbers of an unusual or damaged type")
+
+
 @pytest.mark.parametrize("name", ["pose", "point"])
 def test_groups_and_types_for_datasets(path, name):
     with h5py.File(path, "r+") as file:

@@ -402,9 +402,12 @@ class Recorder:
         self._feeder.join(_ENDING_S)
         stuck = self._feeder.is_alive()
         if stuck:
-            # It takes no data: to close its pipe would wait for the feeder, without end.
+            # It takes no data. To close its pipe here would wait for the feeder, without end, or be
+            # done by both at once. The feeder closes it when the writer's end has broken it.
             self._process.kill()
-        if not finish(self._process, _ENDING_S) or stuck:
+            self._feeder.join(_ENDING_S)
+        ended = not self._feeder.is_alive() and finish(self._process, _ENDING_S)
+        if stuck or not ended:
             self._fail(OutputError(f"{self.path}: the writer did not end and was stopped"))
         self._listener.join(_ENDING_S)
         if self._process.stdout is not None:

@@ -336,7 +336,21 @@ def stored_here(node: Node) -> tuple[h5py.Dataset, Any]:
         raise FormatError(f"{node} is a virtual dataset: recordings must hold their data")
     if layout.get_external_count():
         raise FormatError(f"{node} is stored in another file: recordings must hold their data")
+    _check_numbers(str(node), dataset.id.get_type())
     return dataset, layout
+
+
+def _check_numbers(label: str, kind: h5t.TypeID) -> None:
+    """Refuse integers and floating point numbers of another layout than numpy has.
+
+    HDF5 would convert them. It trusts their description, which may be damaged, and can end the
+    process: Debian's build checks it by assertions.
+    """
+    if kind.get_class() == h5t.ENUM:
+        kind = kind.get_super()
+    numbers = kind.get_class() in (h5t.INTEGER, h5t.FLOAT)
+    if numbers and not kind.equal(h5t.py_create(kind.dtype)):
+        raise FormatError(f"{label} holds numbers of an unusual or damaged type")
 
 
 def _open(parent: h5py.Group, component: bytes, location: str) -> h5py.Group | h5py.Dataset:
@@ -360,6 +374,7 @@ def _attribute(
         kind, space = attribute.get_type(), attribute.get_space()
         if kind.get_class() not in classes:
             raise FormatError(f"{label} must be {needed}")
+        _check_numbers(label, kind)
         # MATLAB and others write a scalar as an array of one element.
         shapes = ((), (1,)) if count == 1 else ((count,),)
         if space.get_simple_extent_type() == h5s.NULL or attribute.shape not in shapes:
