@@ -11,6 +11,7 @@ from hw.midplane.bracket import Placement
 from hw.recording.check import Progress
 from hw.setup.description import Setup
 from jaxcal import InputError
+from jaxcal.data.poses import targets_in_images
 from jaxcal.data.recording import Kind
 from jaxcal.result.calibration import Calibration
 
@@ -69,10 +70,9 @@ class Estimator:
     def warm_up(self, targets: np.ndarray) -> None:
         """Compile before anything moves, on measurements simulated from drawing and plan."""
         live, probe, scene = self._empty(), self._setup.probe, self._setup.scene
-        seen = np.linalg.inv(targets @ scene.image_to_probe) @ np.append(scene.point_mm, 1.0)
         # Slightly off the plane, like real images: an exact fit would be a degenerate problem.
         rng = np.random.default_rng(0)
-        seen = seen[:, :3] + rng.normal(0, 0.2, (len(targets), 3))
+        seen = scene.expected(targets) + rng.normal(0, 0.2, (len(targets), 3))
         if self._kind == "point":
             measured = np.column_stack([seen[:, 0], np.hypot(seen[:, 1], seen[:, 2])])
             measured += rng.normal(0, 0.1, measured.shape)
@@ -108,8 +108,7 @@ class Estimator:
         if self._result is None or self._result.status != "converged":
             return 0.0
         answer = self._result.numpy()
-        seen = np.linalg.inv(pose @ answer.image_to_probe) @ np.append(answer.point, 1.0)
-        return float(seen[1])
+        return float(targets_in_images(pose, answer.image_to_probe, answer.point)[1])
 
     def line(self, total: int, placement: Placement) -> str:
         """The state of the acquisition after an image, for a person."""

@@ -167,7 +167,7 @@ def constraints_of(scene: Scene, extent: Extent, allowed: Allowed | None = None)
 def in_order(poses: np.ndarray, scene: Scene, extent: Extent, passed: int) -> PosePlan:
     """A plan of poses in an order of short travel."""
     tour = _short_tour(poses, scene.tip_mm)
-    expected = np.array([scene.expected(pose)[[0, 2]] for pose in poses])
+    expected = scene.expected(poses)[:, [0, 2]]
     return PosePlan(poses[tour], expected[tour], scene, extent, passed)
 
 
