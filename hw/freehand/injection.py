@@ -44,10 +44,10 @@ from hw.recording.resuming import (
 )
 from hw.recording.session import DELAY_S, Watch, median_times
 from hw.runtime.errors import DeviceError, StaleError
-from hw.runtime.rigid import mean_pose
+from hw.runtime.rigid import mean_pose, turn_deg
 from hw.setup.description import HandHeldSetup
 from hw.ultrasound.receiver import UltrasoundStream
-from jaxcal.data.poses import inverse_poses
+from jaxcal.data.poses import targets_in_images
 from jaxcal.data.recording import MetresError, check_pose_units
 from jaxcal.io.given_files import naming
 from jaxcal.runtime.array_types import Float
@@ -76,16 +76,16 @@ class Sample:
     """One frame of the element and where the probe was.
 
     Attributes:
-        t: arrival, s.
+        frame: as it came.
+        pose: of the probe, mm.
         offset_mm: the probe's offset along the elevational axis at the target.
         peak: amplitude, counts; 0 where the element was not heard.
-        translation: (3,) of the pose, mm.
     """
 
-    t: float
+    frame: EchoFrame
+    pose: Float[np.ndarray, "4 4"]
     offset_mm: float
     peak: float
-    translation: Float[np.ndarray, " 3"]
 
 
 def acquire_by_injection(
@@ -185,7 +185,6 @@ class _Run(Run):
         self._setup, self._echo, self._unit, self._changes = setup, echo, unit, changes
         self._images: deque[PosedImage] = deque(maxlen=_RECENT)
         self._waiting: list[EchoFrame] = []
-        self._held: deque[tuple[float, np.ndarray, EchoFrame]] = deque()
         self._pattern: tuple[int, int] | None = None
         self._patterned = 0.0
         self._heard, self._shown = time.monotonic(), 0.0
@@ -214,7 +213,7 @@ class _Run(Run):
         """Begin a new sweep; places count from where the element is heard first."""
         self._samples: deque[Sample] = deque()
         self._origin: tuple[np.ndarray, np.ndarray] | None = None
-        self._held.clear()
+        """Pose where the element was heard first, and the target in the tracker's frame, mm."""
         self._message, self._hurried = "", False
 
     def _listen(self) -> None:
@@ -260,22 +259,16 @@ class _Run(Run):
         amplitude = np.where(answered, frame.amplitude, 0.0)
         echoes = Echoes(amplitude[None].astype(float), answered[None])
         self._loudest_line = echoes.loudest_line
-        if self._origin is not None:
-            turn = spread_of(np.stack([self._origin[0], pose]))[1]
-            if turn > _ANOTHER_DEG:
-                self._new_sweep()
+        if self._origin is not None and turn_deg(self._origin[0], pose) > _ANOTHER_DEG:
+            self._new_sweep()
         if self._origin is None and echoes.heard:
-            self._origin = pose, self._target_of(frame, echoes.loudest_line)
+            seen = self._target_of(frame, echoes.loudest_line)
+            self._origin = pose, (pose @ self._setup.image_to_probe @ seen)[:3]
         if self._origin is None:
             return
-        offset = self._offset(pose)
-        self._samples.append(Sample(frame.t_host, offset, echoes.peak, pose[:3, 3]))
-        while self._samples[-1].t - self._samples[0].t > _KEPT_S:
+        self._samples.append(Sample(frame, pose, self._offset(pose), echoes.peak))
+        while frame.t_host - self._samples[0].frame.t_host > _KEPT_S:
             self._samples.popleft()
-        self._held.append((frame.t_host, pose, frame))
-        hold = self._asked.rules.hold_s
-        while self._held[-1][0] - self._held[0][0] > hold:
-            self._held.popleft()
 
     def _target_of(self, frame: EchoFrame, line: int) -> Float[np.ndarray, " 4"]:
         """The target in the image frame, roughly: below the loudest line, at the shortest range."""
@@ -287,10 +280,7 @@ class _Run(Run):
     def _offset(self, pose: Float[np.ndarray, "4 4"]) -> float:
         """The probe's offset along the elevational axis at the target, mm."""
         assert self._origin is not None
-        origin, target = self._origin
-        x = self._setup.image_to_probe
-        there = inverse_poses((pose @ x)[None])[0] @ origin @ x @ target
-        return -float(there[1])
+        return -float(targets_in_images(pose, self._setup.image_to_probe, self._origin[1])[1])
 
     def _inject(self, now: float) -> None:
         """Draw the bar again if it has changed, but not more often than the eye can follow."""
@@ -313,10 +303,7 @@ class _Run(Run):
         if not self._samples:
             return None
         loudest = self._loudest
-        seen = tuple((s.offset_mm, bar_length(s.peak, loudest)) for s in self._samples)
-        last = self._samples[-1]
-        longest = max(length for _, length in seen)
-        return View(seen[-1][1], longest, last.offset_mm, 0.0, last.peak, seen)
+        return View(tuple((s.offset_mm, bar_length(s.peak, loudest)) for s in self._samples))
 
     def _show(self) -> None:
         now = time.monotonic()
@@ -337,7 +324,7 @@ class _Run(Run):
             words = f"{title}: {late or f'{reason}: bring the probe over it'}"
             self._person.show(frame, words, "nothing heard yet")
             return
-        rows = [f"{title}: {describe(view, 0.0).rpartition(',')[0]}", *profile(view)]
+        rows = [f"{title}: {describe(view)}", *profile(view)]
         if late:
             rows.append(late)
         elif self._hurried:
@@ -353,7 +340,7 @@ class _Run(Run):
         if min(length for _, length in view.seen) > view.longest // 2:
             return False
         try:
-            check_pose_units(np.array([sample.translation for sample in self._samples]))
+            check_pose_units(np.array([sample.pose[:3, 3] for sample in self._samples]))
         except MetresError:
             return True
         return False
@@ -365,21 +352,23 @@ class _Run(Run):
             return "the element is not heard here"
         if not all(sides_seen(view.seen)):
             return "visit both sides first: the bar must shrink on each"
-        held, rules = list(self._held), self._asked.rules
-        if not held or held[-1][0] - held[0][0] < 0.8 * rules.hold_s:
+        rules, last_s = self._asked.rules, self._samples[-1].frame.t_host
+        held = [s for s in self._samples if last_s - s.frame.t_host <= rules.hold_s]
+        if last_s - held[0].frame.t_host < 0.8 * rules.hold_s:
             return f"hold still for {rules.hold_s:g} s, then accept"
-        poses = np.array([pose for _, pose, _ in held])
-        shift, turn = spread_of(poses)
+        shift, turn = spread_of(np.array([sample.pose for sample in held]))
         if shift > rules.still_mm or turn > rules.still_deg:
             return f"the probe moved ({shift:.1f} mm, {turn:.1f} degrees): hold still, then accept"
         try:
-            bracket, where = self._bracket([frame.t_host for *_, frame in held])
+            peak = fit_peak(*self._sweep(), self._setup.search.full_scale)
         except PlacementError as error:
             return str(error.args[0])
+        where = float(np.mean([sample.offset_mm for sample in held]))
+        bracket = peak.bracket(where, self._setup.search)
         if abs(bracket.centre_mm) > _BESIDE_MM:
             way = "up" if bracket.centre_mm > 0 else "down"
             return f"the bar is longest {abs(bracket.centre_mm):.1f} mm further {way}"
-        self._keep(poses, [frame for *_, frame in held], bracket, where)
+        self._keep(held, bracket, where)
         return ""
 
     def _peak(self) -> float:
@@ -394,31 +383,19 @@ class _Run(Run):
         offsets = np.array([sample.offset_mm for sample in self._samples])
         return offsets, np.array([sample.peak for sample in self._samples])
 
-    def _bracket(self, times: list[float]) -> tuple[Bracket, float]:
-        """The bracket of the target's offset while the probe was held, and the probe's place."""
-        settings = self._setup.search
-        offsets, peaks = self._sweep()
-        peak = fit_peak(offsets, peaks, settings.full_scale)
-        now = np.isin([sample.t for sample in self._samples], times)
-        where = float(offsets[now].mean())
-        return peak.bracket(where, settings), where
-
-    def _keep(
-        self, poses: np.ndarray, frames: list[EchoFrame], bracket: Bracket, where: float
-    ) -> None:
-        times, amplitude = median_times(frames)
-        pose = mean_pose(poses)
+    def _keep(self, held: list[Sample], bracket: Bracket, where: float) -> None:
+        times, amplitude = median_times([sample.frame for sample in held])
+        pose = mean_pose(np.array([sample.pose for sample in held]))
         self._kept.check_unit(pose, self._recorder)
         self._recorder.add_images([self._images[-1].image])
         self._recorder.add_selected(
             pose,
             times,
             kind="time_of_flight",
-            max_elevation=bracket.max_elevation_mm,
             amplitude=amplitude,
-            t_host=frames[-1].t_host,
+            t_host=held[-1].frame.t_host,
             target=self._kept.next_row,
-            bracket=(bracket.centre_mm, bracket.low_mm, bracket.high_mm, bracket.sd_mm),
+            bracket=bracket,
             offset=where,
         )
         self._kept.add(pose)

@@ -76,12 +76,13 @@ class Keys:
         return None
 
 
-def describe(view: View, step_mm: float) -> str:
-    """The view as one line of text."""
+def describe(view: View, step_mm: float = 0.0) -> str:
+    """The view as one line of text, with the step of the next move (mm) where there is one."""
     bar = "#" * view.length
+    step = f", step {step_mm:.2f} mm" if step_mm else ""
     return (
         f"{view.offset_mm:+7.2f} mm |{bar:<{LONGEST}}| {view.length:2d} of {view.longest:2d} "
-        f"seen, step {step_mm:.2f} mm"
+        f"seen{step}"
     )
 
 

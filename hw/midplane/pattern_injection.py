@@ -97,27 +97,34 @@ class View:
     """What the operator sees.
 
     Attributes:
-        length: of the bar, lines.
-        longest: the longest bar seen so far.
-        offset_mm: where the probe is.
-        step_mm: of the next move.
-        amplitude: counts.
-        seen: (offset, length) of every look so far, this one last.
+        seen: (offset in mm, length of the bar in lines) of every look so far, this one last.
+        step_mm: of the next move; 0 where a hand moves the probe.
         frame: gives the newest B-mode frame, or None where there is none; raises the error of a
             device that is lost while the operator looks.
         message: what the procedure has to say.
         title: which pose this is.
     """
 
-    length: int
-    longest: int
-    offset_mm: float
-    step_mm: float
-    amplitude: float
     seen: tuple[tuple[float, int], ...]
+    step_mm: float = 0.0
     frame: Callable[[], Frame | None] = _no_frame
     message: str = ""
     title: str = ""
+
+    @property
+    def offset_mm(self) -> float:
+        """Where the probe is."""
+        return self.seen[-1][0]
+
+    @property
+    def length(self) -> int:
+        """Of the bar, lines."""
+        return self.seen[-1][1]
+
+    @property
+    def longest(self) -> int:
+        """Length of the longest bar seen so far, lines."""
+        return max(length for _, length in self.seen)
 
 
 @dataclass(frozen=True)
@@ -260,23 +267,12 @@ def pattern_injection(
                 raise PlacementError("the amplitude saturates: turn the gain down")
             loudest = max(loudest, echoes.peak)
             heard.append((where, echoes.peak))
-            seen = [(at, bar_length(amplitude, loudest)) for at, amplitude in heard]
+            seen = tuple((at, bar_length(amplitude, loudest)) for at, amplitude in heard)
+            view = View(seen, settings.fine_mm, frame, message, title)
             lines = echoes.amplitude.shape[1]
-            injector.load_pattern(bar(seen[-1][1], echoes.loudest_line, lines))
+            injector.load_pattern(bar(view.length, echoes.loudest_line, lines))
             injector.inject(True, _DELAY_TICKS)
-            decision = operator(
-                View(
-                    seen[-1][1],
-                    max(length for _, length in seen),
-                    where,
-                    settings.fine_mm,
-                    echoes.peak,
-                    tuple(seen),
-                    frame,
-                    message,
-                    title,
-                )
-            )
+            decision = operator(view)
             message = ""
             if decision.what == "give-up":
                 raise SkippedError("the operator gave up the pose")

@@ -31,6 +31,7 @@ from jaxcal import CalibrationError, FormatError, OutputError
 
 if TYPE_CHECKING:
     from hw.active_echo.device import EchoFrame
+    from hw.midplane.bracket import Bracket
     from hw.robot.stream import PoseSample
     from hw.ultrasound.receiver import Image
     from jaxcal.data.timing import ClockFit
@@ -193,11 +194,10 @@ class Recorder:
         measurement: np.ndarray,
         *,
         kind: str,
-        max_elevation: float,
         amplitude: float,
         t_host: float,
         target: int,
-        bracket: tuple[float, float, float, float],
+        bracket: Bracket,
         offset: float = 0.0,
         true_elevation: float = float("nan"),
         seconds: float = 0.0,
@@ -208,11 +208,10 @@ class Recorder:
             pose: (4, 4) probe -> tracker, mm.
             measurement: (elements,) times of flight, s, or (2,) point, mm.
             kind: ``time_of_flight`` or ``point``, the recording's.
-            max_elevation: bound on |elevational offset|, mm.
             amplitude: received.
             t_host: s.
             target: row of the plan.
-            bracket: centre, low, high, sd of the target's elevational offset, mm.
+            bracket: of the target's elevational offset.
             offset: of the probe from the plan's pose along its elevational axis, mm.
             true_elevation: the emulated bench's truth, mm.
             seconds: how long the image took, in the bench's time.
@@ -223,20 +222,19 @@ class Recorder:
         self._row(
             "calibration",
             pose=pose,
-            max_elevation=max_elevation,
+            max_elevation=bracket.max_elevation_mm,
             amplitude=amplitude,
             mask=True,
             time=t_host,
             target=target,
             **{kind: measurement},
         )
-        centre, low, high, sd = bracket
         self._row(
             "placement",
-            centre=centre,
-            low=low,
-            high=high,
-            sd=sd,
+            centre=bracket.centre_mm,
+            low=bracket.low_mm,
+            high=bracket.high_mm,
+            sd=bracket.sd_mm,
             offset=offset,
             true_elevation=true_elevation,
             seconds=seconds,
