@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hw.midplane.bracket import Bracket, Placement, widened
+from hw.midplane.bracket import Bracket, Placement
 from hw.midplane.search import PlacementError, Settings, Walker, coarse, procedure
 from jaxcal.runtime.array_types import Float
 
@@ -31,21 +31,17 @@ class Peak:
         sd_mm: its standard deviation.
         amplitude: fitted, counts.
         width_mm: SD of the Gaussian across the beam.
-        used: samples in the fit.
     """
 
     place_mm: float
     sd_mm: float
     amplitude: float
     width_mm: float
-    used: int
 
     def bracket(self, where_mm: float, settings: Settings) -> Bracket:
         """Where the target's offset lies in an image that was taken at ``where_mm``."""
-        centre, half = self.place_mm - where_mm, settings.factor * self.sd_mm
-        return widened(
-            centre, centre - half, centre + half, self.sd_mm, settings.hidden_sd_mm, settings.factor
-        )
+        half = settings.factor * self.sd_mm
+        return settings.bracket(self.place_mm - where_mm, half, self.sd_mm)
 
 
 def fit_peak(
@@ -92,7 +88,6 @@ def fit_peak(
         sd_mm=float(np.sqrt(gradient @ covariance @ gradient)),
         amplitude=float(np.exp(top - slope**2 / (4 * curvature))),
         width_mm=float(np.sqrt(-0.5 / curvature)),
-        used=len(x),
     )
 
 
@@ -168,30 +163,25 @@ def _overview(walker: Walker, start_mm: float) -> tuple[float, float]:
     return float(x[best]), 0.5 * settings.coarse_mm
 
 
-def go_to_peak(walker: Walker, peak: Peak) -> tuple[float, float]:
+def go_to_peak(walker: Walker, peak: Peak) -> None:
     """Go to a fitted maximum from below, and check by the amplitude that it is there.
-
-    Returns:
-        Where the probe stands (mm, tracked) and the amplitude there.
 
     Raises:
         PlacementError: the amplitude says that the maximum is elsewhere: the motion has hysteresis,
             or the target moved.
     """
-    where, echoes = walker.stop_at(peak.place_mm)
+    _, echoes = walker.stop_at(peak.place_mm)
     if not echoes.heard:
         walker.recover()
-        where, echoes = walker.stop_at(peak.place_mm)
-    amplitude = echoes.peak
+        _, echoes = walker.stop_at(peak.place_mm)
     if not echoes.saturated(walker.settings.full_scale):
-        ratio = max(peak.amplitude / max(amplitude, 1e-9), 1.0)
+        ratio = max(peak.amplitude / max(echoes.peak, 1e-9), 1.0)
         off = peak.width_mm * float(np.sqrt(2 * np.log(ratio)))
         if off > walker.settings.hysteresis_mm:
             raise PlacementError(
                 f"back at the maximum the amplitude is that of {off:.2f} mm beside it: the motion "
                 "has hysteresis, or the target moved"
             )
-    return where, amplitude
 
 
 @procedure
@@ -200,11 +190,9 @@ def amplitude_scan(walker: Walker, start_mm: float) -> Placement:
     settings = walker.settings
     peak = scan_up(walker, coarse(walker, start_mm), settings.fine_mm)
     try:
-        where, amplitude = go_to_peak(walker, peak)
+        go_to_peak(walker, peak)
     except PlacementError:
         walker.notes.append("the maximum was not found again; scanned once more")
         peak = scan_up(walker, peak.place_mm - settings.coarse_mm, settings.fine_mm)
-        where, amplitude = go_to_peak(walker, peak)
-    half = settings.factor * peak.sd_mm
-    edges = (peak.place_mm - half, peak.place_mm + half)
-    return walker.placement("amplitude-scan", where, edges, peak.sd_mm, amplitude)
+        go_to_peak(walker, peak)
+    return walker.placement(peak.place_mm, settings.factor * peak.sd_mm, peak.sd_mm)

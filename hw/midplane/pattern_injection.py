@@ -280,10 +280,10 @@ def pattern_injection(
                 low, high = flanks(seen, where)
                 enough = all(sides_seen(seen)) and echoes.heard
                 if enough and low is not None and high is not None:
-                    edges = (0.5 * sum(low), 0.5 * sum(high))
+                    first, last = 0.5 * sum(low), 0.5 * sum(high)
                     spread = np.hypot(low[1] - low[0], high[1] - high[0]) / np.sqrt(48.0)
                     spread = float(np.hypot(spread, settings.position_sd_mm / np.sqrt(2.0)))
-                    return walker.placement("pattern-injection", where, edges, spread, echoes.peak)
+                    return walker.placement(0.5 * (first + last), 0.5 * (last - first), spread)
                 message = "visit both sides first: the bar must shrink on each"
                 continue
             where, echoes = walker.stop_at(decision.offset_mm)

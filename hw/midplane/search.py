@@ -19,7 +19,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from hw.midplane.bracket import Placement, widened
+from hw.midplane.bracket import Bracket, Placement
 from hw.runtime.errors import Device, DeviceError
 from jaxcal import InputError
 from jaxcal.runtime.array_types import Bool, Float
@@ -154,6 +154,22 @@ class Settings:
         """SD of the errors that no search sees: response's shift, last stop's repeatability; mm."""
         return float(np.hypot(self.response_sd_mm, self.position_sd_mm))
 
+    def bracket(self, centre_mm: float, half_mm: float, sd_mm: float) -> Bracket:
+        """A bracket from what a search found and the independent errors that it cannot see.
+
+        Args:
+            centre_mm: best guess of the target's offset.
+            half_mm: from there to either edge as seen.
+            sd_mm: SD of the guess itself.
+
+        Returns:
+            Its ends: their distance from the centre is the root of the summed squares of
+            ``half_mm`` and of ``factor`` times the SD of the hidden errors.
+        """
+        half = float(np.hypot(half_mm, self.factor * self.hidden_sd_mm))
+        sd = float(np.hypot(sd_mm, self.hidden_sd_mm))
+        return Bracket(centre_mm, centre_mm - half, centre_mm + half, sd)
+
 
 @runtime_checkable
 class Procedure(Protocol):
@@ -191,7 +207,7 @@ class Walker:
         self.good: float | None = None
         self._good_amplitude = 0.0
         self.threshold = -1
-        self.moves, self.frames, self.travel_mm = 0, 0, 0.0
+        self.moves, self.travel_mm = 0, 0.0
         self.samples: list[tuple[float, float, int]] = []
         self.notes: list[str] = []
 
@@ -231,7 +247,6 @@ class Walker:
     def listen(self) -> Echoes:
         """Listen where the probe stands; remembers the place if it is heard."""
         echoes = self._bench.read(self.settings.frames)
-        self.frames += len(echoes.amplitude)
         # A place where the response is much weaker is not kept as a good place.
         if echoes.heard and (self.good is None or echoes.peak >= 0.5 * self._good_amplitude):
             self.good, self._good_amplitude = self._at, echoes.peak
@@ -273,32 +288,18 @@ class Walker:
             with contextlib.suppress(PlacementError):
                 self.go(self.good)
 
-    def placement(
-        self,
-        procedure: str,
-        offset: float,
-        edges: tuple[float, float],
-        sd_mm: float,
-        amplitude: float,
-    ) -> Placement:
-        """The result with the probe at ``offset``; ``edges`` bound the mid-plane's offset, mm."""
+    def placement(self, middle_mm: float, half_mm: float, sd_mm: float) -> Placement:
+        """The result where the probe stands.
+
+        Args:
+            middle_mm: offset of the mid-plane.
+            half_mm: from there to either edge as seen.
+            sd_mm: SD of the middle itself.
+        """
         # The target's offset in the image is the mid-plane's place minus the probe's.
-        low, high = edges[0] - offset, edges[1] - offset
-        bracket = widened(
-            0.5 * (low + high), low, high, sd_mm, self.settings.hidden_sd_mm, self.settings.factor
-        )
-        return Placement(
-            procedure,
-            bracket,
-            self.where,
-            amplitude,
-            self.threshold,
-            self.moves,
-            self.travel_mm,
-            self.frames,
-            np.array(self.samples, float).reshape(-1, 3),
-            tuple(self.notes),
-        )
+        bracket = self.settings.bracket(middle_mm - self.where, half_mm, sd_mm)
+        samples = np.array(self.samples, float).reshape(-1, 3)
+        return Placement(bracket, self.where, self.moves, samples, tuple(self.notes))
 
 
 def procedure(search: Callable[[Walker, float], Placement]) -> Procedure:
@@ -369,7 +370,6 @@ def first_seen(walker: Walker, start_mm: float) -> Placement:
     Raises:
         PlacementError: it is heard nowhere.
     """
-    offset = coarse(walker, start_mm)
-    half, amplitude = walker.settings.beam_half_mm, walker.samples[-1][1]
-    edges = (offset - half, offset + half)
-    return walker.placement("first-seen", offset, edges, half / np.sqrt(3.0), amplitude)
+    coarse(walker, start_mm)
+    half = walker.settings.beam_half_mm
+    return walker.placement(walker.where, half, half / np.sqrt(3.0))

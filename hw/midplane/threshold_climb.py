@@ -148,13 +148,11 @@ def threshold_climb(walker: Walker, start_mm: float) -> Placement:
             "the beam is asymmetric, or the target moved"
         )
     walker.set_threshold(settings.low_threshold)
-    where, echoes = walker.stop_at(edges.middle_mm)
+    _, echoes = walker.stop_at(edges.middle_mm)
     if not echoes.heard:
         walker.recover()
         raise PlacementError("the response was lost at the place that the climb found")
-    return walker.placement(
-        "threshold-climb", where, (edges.low_mm, edges.high_mm), edges.sd_mm, echoes.peak
-    )
+    return walker.placement(edges.middle_mm, edges.half_mm, edges.sd_mm)
 
 
 def _apart(edges: Edges, peak: Peak, settings: Settings) -> float:

@@ -39,9 +39,7 @@ from hw.setup.emulated import setup_of, start
 from hw.view.feed import LiveView, halved, watched
 from hw.view.page import ellipsoid, to_scale, towards
 
-PLACEMENT = Placement(
-    "none", Bracket(0.1, -0.7, 0.9, 0.3), 0.1, 800.0, 100, 3, 1.0, 9, np.zeros((0, 3))
-)
+PLACEMENT = Placement(Bracket(0.1, -0.7, 0.9, 0.3), 0.1, 3, np.zeros((0, 3)))
 
 
 def wait_until(condition, timeout_s: float = 180.0) -> None:
