@@ -43,11 +43,14 @@ _MOST_MEMBERS = 100
 """Arrays in a group that is written once: ten times what an acquisition writes."""
 
 
-def check_resumable(path: str | os.PathLike[str]) -> None:
+def check_resumable(path: str | os.PathLike[str]) -> bool:
     """Check a file before it is opened for writing; it is not trusted, and not changed.
 
     A file that is shorter than its own superblock says (:func:`stored_length`) is read as if zeros
     were at its end. Text that the writer may touch is read, so that its heaps are checked too.
+
+    Returns:
+        Whether it came to its end before, without an image of every pose.
 
     Raises:
         FormatError: missing, not a recording, complete with all images, of another layout, with
@@ -56,7 +59,8 @@ def check_resumable(path: str | os.PathLike[str]) -> None:
     with opened(path) as root:
         if text(root, "format") != FORMAT or number(root, "version") != VERSION:
             raise FormatError("is not a recording of this version")
-        if flag(root, "complete") is not False and not _lacks_images(root):
+        complete = flag(root, "complete")
+        if complete is not False and not _lacks_images(root):
             raise FormatError("is complete: there is nothing to resume")
         for name, columns in LAYOUT.items():
             node = _existing(root, name)
@@ -74,17 +78,7 @@ def check_resumable(path: str | os.PathLike[str]) -> None:
                 for member in members(node, _MOST_MEMBERS):
                     stored_here(member)
                     check_attributes(member)
-
-
-def is_complete(path: str | os.PathLike[str]) -> bool:
-    """Whether a recording that can be resumed (:func:`check_resumable`) came to its end before.
-
-    Raises:
-        FormatError: it cannot be resumed.
-    """
-    check_resumable(path)
-    with opened(path) as root:
-        return flag(root, "complete") is True
+    return complete is True
 
 
 def _lacks_images(root: Node) -> bool:
