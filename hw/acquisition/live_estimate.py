@@ -39,13 +39,14 @@ class Estimator:
         self._setup, self._capacity = setup, capacity
         self._kind: Kind = "point" if kind == "point" else "time_of_flight"
         self._live = self._empty()
-        self._result: Calibration | None = None
+        self.answer: Calibration | None = None
+        """The calibration from the images so far; None with too few."""
         self._left_out = 0
         if progress is not None:
             rows = zip(progress.poses, progress.measurements, progress.max_elevation, strict=True)
             for pose, measurement, bound in rows:
                 self._put(pose, measurement, bound)
-            self._result = self._solve()
+            self.answer = self._solve()
 
     def _empty(self) -> LiveCalibration:
         return LiveCalibration(
@@ -61,11 +62,6 @@ class Estimator:
     def poses(self) -> np.ndarray:
         """(n, 4, 4) of the images that the calibration takes, mm, in the order of its arrays."""
         return self._live.poses
-
-    @property
-    def answer(self) -> Calibration | None:
-        """The calibration from the images so far; None with too few."""
-        return self._result
 
     def warm_up(self, targets: np.ndarray) -> None:
         """Compile before anything moves, on measurements simulated from drawing and plan."""
@@ -86,10 +82,10 @@ class Estimator:
     def add(self, pose: np.ndarray, measurement: np.ndarray, bound: float) -> dict[str, Any] | None:
         """Take an image and solve; a row of /estimate, or None with too few images."""
         if self._put(pose, measurement, bound):
-            self._result = self._solve()
-        if self._result is None:
+            self.answer = self._solve()
+        if self.answer is None:
             return None
-        answer = self._result.numpy()
+        answer = self.answer.numpy()
         return {
             "images": answer.mask.sum(),
             "image_to_probe": answer.image_to_probe,
@@ -105,9 +101,9 @@ class Estimator:
 
         0 where nothing is known yet.
         """
-        if self._result is None or self._result.status != "converged":
+        if self.answer is None or self.answer.status != "converged":
             return 0.0
-        answer = self._result.numpy()
+        answer = self.answer.numpy()
         return float(targets_in_images(pose, answer.image_to_probe, answer.point)[1])
 
     def line(self, total: int, placement: Placement) -> str:
@@ -117,16 +113,16 @@ class Estimator:
             f"image {self.count}/{total}: offset {bracket.centre_mm:+.2f} mm in "
             f"[{bracket.low_mm:+.2f}, {bracket.high_mm:+.2f}], {placement.moves} moves"
         )
-        if self._result is None:
+        if self.answer is None:
             return f"{head}; no estimate yet"
-        answer = self._result.numpy()
+        answer = self.answer.numpy()
         x, y, z = answer.image_to_probe[:3, 3]
         head += f"; X at ({x:.2f}, {y:.2f}, {z:.2f}) mm"
         if np.isfinite(answer.covariance).all():
             mm = float(np.sqrt(np.trace(answer.covariance[:3, :3])))
             degrees = float(np.degrees(np.sqrt(np.trace(answer.covariance[3:, 3:]))))
             head += f" +- {mm:.2f} mm, {degrees:.2f} deg (SD)"
-        return f"{head}; RMS {float(answer.rms):.2f} mm; {self._result.status}"
+        return f"{head}; RMS {float(answer.rms):.2f} mm; {self.answer.status}"
 
     def _put(self, pose: np.ndarray, measurement: np.ndarray, bound: float) -> bool:
         """Whether the calibration takes the image."""
