@@ -147,12 +147,7 @@ class ActiveEcho(Sensor):
     reflection for the element. It is 2 mm wide: the place on it that hears the most moves with the
     direction of the sound (:meth:`hw.bench.world.World.shift_mm`), and its mark is wider than a
     point's.
-
-    Attributes:
-        size_mm: outer diameter.
     """
-
-    size_mm: float = ELEMENT_MM
 
     name = "active-echo"
     answers = True

@@ -33,7 +33,7 @@ from hw.midplane.bracket import Bracket
 from hw.midplane.live_view import describe, profile
 from hw.midplane.pattern_injection import View, bar, bar_length, sides_seen
 from hw.midplane.search import Echoes, PlacementError
-from hw.recording.check import electronics_of, probe_of
+from hw.recording.check import devices_of
 from hw.recording.layout import RecordingHeader
 from hw.recording.recorder import Recorder
 from hw.recording.resuming import (
@@ -118,10 +118,10 @@ def acquire_by_injection(
     kept, probe, before = KeptImages(), setup.probe, {}
     if resume:
         asked, told = recorded_request(path, _KIND, asked)
+        known, before = devices_of(path)
         with naming(path):
-            check_same("probe", probe_of(path), described_probe(probe))
+            check_same("probe", known, described_probe(probe))
             check_same("scene", told.get("scene"), _scene(setup))
-        before = electronics_of(path)
         kept = KeptImages(read_images(path))
     with contextlib.ExitStack() as stack:
         stream = stack.enter_context(UltrasoundStream(asked.host, asked.port, device=asked.device))

@@ -101,7 +101,7 @@ class Progress:
         true_elevation: (k,) mm, NaN on a real bench.
         last_s: latest host time in the file.
         probe: numbers of /probe: elements, pitch_mm, sound_speed_m_s, delay_s.
-        electronics: see :func:`electronics_of`.
+        electronics: ``clock_hz`` and ``identity``, as far as it has them.
         ended: whether a run came to its end before, with poses skipped or given up.
     """
 
@@ -164,24 +164,14 @@ def settings_of(path: str | os.PathLike[str]) -> dict[str, object]:
         return _settings(root)
 
 
-def probe_of(path: str | os.PathLike[str]) -> dict[str, float]:
-    """Numbers of a recording's /probe, as in :class:`Progress`; the file is not trusted.
+def devices_of(path: str | os.PathLike[str]) -> tuple[dict[str, float], dict[str, object]]:
+    """Probe and electronics of a recording, as in :class:`Progress`; the file is not trusted.
 
     Raises:
         FormatError: not an acquisition's recording.
     """
     with opened(path) as root:
-        return _probe(root)
-
-
-def electronics_of(path: str | os.PathLike[str]) -> dict[str, object]:
-    """``clock_hz`` and ``identity`` of the electronics of a recording, as far as it has them.
-
-    Raises:
-        FormatError: not an acquisition's recording; the file is not trusted.
-    """
-    with opened(path) as root:
-        return _electronics(root)
+        return _probe(root), _electronics(root)
 
 
 @contextmanager

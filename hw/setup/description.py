@@ -111,8 +111,8 @@ class Setup:
             raise refused(
                 f"the setup is for a {model}, but the controller is that of a {controller_model}"
             )
-        width = self.probe.elements * self.probe.pitch_mm
-        hull = hull_of(self.scene.image_to_probe, *(self.housing_mm or (width, *_HOUSING_MM)))
+        housing = self.housing_mm or (self.probe.width_mm, *_HOUSING_MM)
+        hull = hull_of(self.scene.image_to_probe, *housing)
         return Limits.from_mapping(
             {"hull_mm": hull, **self.limits, "tip_mm": tip.tolist(), "arm_model": model}
         )
@@ -356,7 +356,7 @@ def _check_lengths(setup: Setup, tip_at_tcp: bool) -> None:
 
 
 def _check_width(probe: LinearProbe) -> None:
-    width = probe.elements * probe.pitch_mm
+    width = probe.width_mm
     if not _WIDTH_MM[0] <= width <= _WIDTH_MM[1]:
         raise InputError(
             f"[probe] elements and pitch_mm make an array {width:g} mm wide: pitch_mm is in mm, "
