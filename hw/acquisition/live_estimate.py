@@ -109,10 +109,11 @@ class Estimator:
     def line(self, total: int, placement: Placement) -> str:
         """The state of the acquisition after an image, for a person."""
         bracket = placement.bracket
-        head = (
+        placed = (
             f"image {self.count}/{total}: offset {bracket.centre_mm:+.2f} mm in "
             f"[{bracket.low_mm:+.2f}, {bracket.high_mm:+.2f}], {placement.moves} moves"
         )
+        head = "; ".join([placed, *placement.notes])
         if self.answer is None:
             return f"{head}; no estimate yet"
         answer = self.answer.numpy()
