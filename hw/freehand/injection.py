@@ -134,7 +134,7 @@ def acquire_by_injection(
         unit = described_electronics(echo)
         changes = compare_electronics(before, unit)
         recorder = Recorder(path) if resume else _recorder(path, asked, setup, posed)
-        run = _Run(asked, setup, person, posed, echo, unit, changes, recorder, kept)
+        run = _Run(asked, person, posed, recorder, kept, setup, echo, unit, changes)
         return run.completed()
 
 
@@ -165,24 +165,19 @@ def _switch_off(echo: ActiveEcho) -> None:
         echo.inject(False)
 
 
+@dataclass
 class _Run(Run):
     """Images are taken when the person accepts a place in the middle of a sweep."""
 
-    def __init__(
-        self,
-        asked: FreeHand,
-        setup: HandHeldSetup,
-        person: Person,
-        posed: PosedImages,
-        echo: ActiveEcho,
-        unit: dict[str, float | str],
-        changes: list[str],
-        recorder: Recorder,
-        kept: KeptImages,
-    ) -> None:
-        super().__init__(asked, person, posed, recorder, kept)
-        self.options = ("--placement", _KIND, "--setup", setup.source)
-        self._setup, self._echo, self._unit, self._changes = setup, echo, unit, changes
+    setup: HandHeldSetup
+    echo: ActiveEcho
+    unit: dict[str, float | str]
+    """What the recording keeps of the electronics."""
+    changes: list[str]
+    """Lines about what has changed since the recording was begun."""
+
+    def __post_init__(self) -> None:
+        self.options = ("--placement", _KIND, "--setup", self.setup.source)
         self._images: deque[PosedImage] = deque(maxlen=_RECENT)
         self._waiting: list[EchoFrame] = []
         self._pattern: tuple[int, int] | None = None
@@ -194,8 +189,8 @@ class _Run(Run):
 
     def begin(self) -> None:
         """Record the electronics, and what has changed since the recording was begun."""
-        self._recorder.attributes("ae", self._unit)
-        for change in self._changes:
+        self.recorder.attributes("ae", self.unit)
+        for change in self.changes:
             self.note("changed", change)
 
     def look(self, key: str | None) -> None:
@@ -218,21 +213,21 @@ class _Run(Run):
 
     def _listen(self) -> None:
         # Read all images that wait: the bar must show where the probe is now, however busy the PC.
-        self._images.append(self._posed.read(_SILENCE_S))
-        for _ in range(self._posed.behind - 1):
-            self._images.append(self._posed.read(_SILENCE_S))
-        frames = self._echo.drain()
+        self._images.append(self.posed.read(_SILENCE_S))
+        for _ in range(self.posed.behind - 1):
+            self._images.append(self.posed.read(_SILENCE_S))
+        frames = self.echo.drain()
         now = time.monotonic()
         if frames:
             self._heard = now
         elif now - self._heard > _SILENCE_S:
             raise StaleError(f"no frame for {_SILENCE_S:g} s: {SILENT}", device="active echo")
-        self._recorder.add_echo(frames)
+        self.recorder.add_echo(frames)
         if frames:
             self._late_s = frames[-1].late_s
         if now - self._delay_measured > DELAY_S:
             self._delay_measured = now
-            self._echo.measure_delay()
+            self.echo.measure_delay()
         self._waiting += [frame for frame in frames if not frame.late_s > _LATEST_S]
         later = []
         for frame in self._waiting:
@@ -263,7 +258,7 @@ class _Run(Run):
             self._new_sweep()
         if self._origin is None and echoes.heard:
             seen = self._target_of(frame, echoes.loudest_line)
-            self._origin = pose, (pose @ self._setup.image_to_probe @ seen)[:3]
+            self._origin = pose, (pose @ self.setup.image_to_probe @ seen)[:3]
         if self._origin is None:
             return
         self._samples.append(Sample(frame, pose, self._offset(pose), echoes.peak))
@@ -272,7 +267,7 @@ class _Run(Run):
 
     def _target_of(self, frame: EchoFrame, line: int) -> Float[np.ndarray, " 4"]:
         """The target in the image frame, roughly: below the loudest line, at the shortest range."""
-        probe = self._setup.probe
+        probe = self.setup.probe
         lateral = probe.element_positions()[line, 0]
         distance = float(np.nanmin(probe.one_way_range_mm(frame.tof_s)))
         return np.array([lateral, 0.0, distance, 1.0])
@@ -280,7 +275,7 @@ class _Run(Run):
     def _offset(self, pose: Float[np.ndarray, "4 4"]) -> float:
         """The probe's offset along the elevational axis at the target, mm."""
         assert self._origin is not None
-        return -float(targets_in_images(pose, self._setup.image_to_probe, self._origin[1])[1])
+        return -float(targets_in_images(pose, self.setup.image_to_probe, self._origin[1])[1])
 
     def _inject(self, now: float) -> None:
         """Draw the bar again if it has changed, but not more often than the eye can follow."""
@@ -290,8 +285,8 @@ class _Run(Run):
         if self._pattern == (length, self._loudest_line):
             return
         self._pattern, self._patterned = (length, self._loudest_line), now
-        self._echo.load_pattern(bar(length, self._loudest_line, self._setup.probe.elements))
-        self._echo.inject(True, _DELAY_TICKS)
+        self.echo.load_pattern(bar(length, self._loudest_line, self.setup.probe.elements))
+        self.echo.inject(True, _DELAY_TICKS)
 
     @property
     def _loudest(self) -> float:
@@ -311,7 +306,7 @@ class _Run(Run):
             return
         self._shown = now
         frame = self._images[-1].image.array
-        title = f"image {len(self._kept) + 1} of {self._asked.images}"
+        title = f"image {len(self.kept) + 1} of {self.asked.images}"
         view = self._view()
         late = ""
         late_s = self._images[-1].image.late_s
@@ -322,7 +317,7 @@ class _Run(Run):
         if view is None:
             reason = self._images[-1].why or "the element is not heard"
             words = f"{title}: {late or f'{reason}: bring the probe over it'}"
-            self._person.show(frame, words, "nothing heard yet")
+            self.person.show(frame, words, "nothing heard yet")
             return
         rows = [f"{title}: {describe(view)}", *profile(view)]
         if late:
@@ -333,7 +328,7 @@ class _Run(Run):
             rows.append("the poses look like metres: let the server send them in mm")
         elif self._message:
             rows.append(self._message)
-        self._person.show(frame, "\n".join(rows), hand_advice(view, self._peak()))
+        self.person.show(frame, "\n".join(rows), hand_advice(view, self._peak()))
 
     def _in_metres(self, view: View) -> bool:
         """Whether the bar shrinks while the probe, by its poses, stays where it is."""
@@ -352,7 +347,7 @@ class _Run(Run):
             return "the element is not heard here"
         if not all(sides_seen(view.seen)):
             return "visit both sides first: the bar must shrink on each"
-        rules, last_s = self._asked.rules, self._samples[-1].frame.t_host
+        rules, last_s = self.asked.rules, self._samples[-1].frame.t_host
         held = [s for s in self._samples if last_s - s.frame.t_host <= rules.hold_s]
         if last_s - held[0].frame.t_host < 0.8 * rules.hold_s:
             return f"hold still for {rules.hold_s:g} s, then accept"
@@ -360,11 +355,11 @@ class _Run(Run):
         if shift > rules.still_mm or turn > rules.still_deg:
             return f"the probe moved ({shift:.1f} mm, {turn:.1f} degrees): hold still, then accept"
         try:
-            peak = fit_peak(*self._sweep(), self._setup.search.full_scale)
+            peak = fit_peak(*self._sweep(), self.setup.search.full_scale)
         except PlacementError as error:
             return str(error.args[0])
         where = float(np.mean([sample.offset_mm for sample in held]))
-        bracket = peak.bracket(where, self._setup.search)
+        bracket = peak.bracket(where, self.setup.search)
         if abs(bracket.centre_mm) > _BESIDE_MM:
             way = "up" if bracket.centre_mm > 0 else "down"
             return f"the bar is longest {abs(bracket.centre_mm):.1f} mm further {way}"
@@ -375,7 +370,7 @@ class _Run(Run):
         """Where the bar is longest, mm: the fitted maximum, or the loudest place without one."""
         offsets, peaks = self._sweep()
         try:
-            return fit_peak(offsets, peaks, self._setup.search.full_scale).place_mm
+            return fit_peak(offsets, peaks, self.setup.search.full_scale).place_mm
         except PlacementError:
             return float(offsets[int(np.argmax(peaks))])
 
@@ -386,21 +381,21 @@ class _Run(Run):
     def _keep(self, held: list[Sample], bracket: Bracket, where: float) -> None:
         times, amplitude = median_times([sample.frame for sample in held])
         pose = mean_pose(np.array([sample.pose for sample in held]))
-        self._kept.check_unit(pose, self._recorder)
-        self._recorder.add_images([self._images[-1].image])
-        self._recorder.add_selected(
+        self.kept.check_unit(pose, self.recorder)
+        self.recorder.add_images([self._images[-1].image])
+        self.recorder.add_selected(
             pose,
             times,
             kind="time_of_flight",
             amplitude=amplitude,
             t_host=held[-1].frame.t_host,
-            target=self._kept.next_row,
+            target=self.kept.next_row,
             bracket=bracket,
             offset=where,
         )
-        self._kept.add(pose)
-        self._person.say(
-            f"image {len(self._kept)}/{self._asked.images}: offset {bracket.centre_mm:+.2f} in "
+        self.kept.add(pose)
+        self.person.say(
+            f"image {len(self.kept)}/{self.asked.images}: offset {bracket.centre_mm:+.2f} in "
             f"[{bracket.low_mm:+.2f}, {bracket.high_mm:+.2f}] mm"
         )
         self._new_sweep()

@@ -259,15 +259,14 @@ def pattern_injection(
     def search(walker: Walker, start_mm: float) -> Placement:
         settings = walker.settings
         coarse(walker, start_mm)
-        loudest, message = 0.0, ""
-        heard: list[tuple[float, float]] = []
-        where, echoes = walker.where, walker.listen()
+        first, message = len(walker.samples), ""
+        echoes = walker.listen()
         for _ in range(_MOST_LOOKS):
             if echoes.saturated(settings.full_scale):
                 raise PlacementError("the amplitude saturates: turn the gain down")
-            loudest = max(loudest, echoes.peak)
-            heard.append((where, echoes.peak))
-            seen = tuple((at, bar_length(amplitude, loudest)) for at, amplitude in heard)
+            looks = walker.samples[first:]
+            loudest = max(peak for _, peak, _ in looks)
+            seen = tuple((at, bar_length(peak, loudest)) for at, peak, _ in looks)
             view = View(seen, settings.fine_mm, frame, message, title)
             lines = echoes.amplitude.shape[1]
             injector.load_pattern(bar(view.length, echoes.loudest_line, lines))
@@ -277,16 +276,16 @@ def pattern_injection(
             if decision.what == "give-up":
                 raise SkippedError("the operator gave up the pose")
             if decision.what == "accept":
-                low, high = flanks(seen, where)
+                low, high = flanks(seen, walker.where)
                 enough = all(sides_seen(seen)) and echoes.heard
                 if enough and low is not None and high is not None:
-                    first, last = 0.5 * sum(low), 0.5 * sum(high)
+                    lower, upper = 0.5 * sum(low), 0.5 * sum(high)
                     spread = np.hypot(low[1] - low[0], high[1] - high[0]) / np.sqrt(48.0)
                     spread = float(np.hypot(spread, settings.position_sd_mm / np.sqrt(2.0)))
-                    return walker.placement(0.5 * (first + last), 0.5 * (last - first), spread)
+                    return walker.placement(0.5 * (lower + upper), 0.5 * (upper - lower), spread)
                 message = "visit both sides first: the bar must shrink on each"
                 continue
-            where, echoes = walker.stop_at(decision.offset_mm)
+            _, echoes = walker.stop_at(decision.offset_mm)
         raise PlacementError(f"not accepted after {_MOST_LOOKS} looks")
 
     try:
