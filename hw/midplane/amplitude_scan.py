@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hw.midplane.bracket import Bracket, Placement
-from hw.midplane.search import PlacementError, Settings, Walker, coarse, procedure
+from hw.midplane.search import Bench, PlacementError, Settings, Walker, Watch, coarse
 from jaxcal.runtime.array_types import Float
 
 LEAST_FRACTION = 0.4
@@ -184,15 +184,23 @@ def go_to_peak(walker: Walker, peak: Peak) -> None:
             )
 
 
-@procedure
-def amplitude_scan(walker: Walker, start_mm: float) -> Placement:
-    """Scan with the robot, fit the maximum, go there."""
-    settings = walker.settings
-    peak = scan_up(walker, coarse(walker, start_mm), settings.fine_mm)
-    try:
-        go_to_peak(walker, peak)
-    except PlacementError:
-        walker.notes.append("the maximum was not found again; scanned once more")
-        peak = scan_up(walker, peak.place_mm - settings.coarse_mm, settings.fine_mm)
-        go_to_peak(walker, peak)
-    return walker.placement(peak.place_mm, settings.factor * peak.sd_mm, peak.sd_mm)
+def amplitude_scan(
+    bench: Bench,
+    settings: Settings | None = None,
+    start_mm: float = 0.0,
+    watch: Watch | None = None,
+) -> Placement:
+    """Scan with the robot, fit the maximum, go there.
+
+    Arguments as of :func:`hw.midplane.search.first_seen`.
+    """
+    with Walker(bench, settings, watch) as walker:
+        settings = walker.settings
+        peak = scan_up(walker, coarse(walker, start_mm), settings.fine_mm)
+        try:
+            go_to_peak(walker, peak)
+        except PlacementError:
+            walker.notes.append("the maximum was not found again; scanned once more")
+            peak = scan_up(walker, peak.place_mm - settings.coarse_mm, settings.fine_mm)
+            go_to_peak(walker, peak)
+        return walker.placement(peak.place_mm, settings.factor * peak.sd_mm, peak.sd_mm)

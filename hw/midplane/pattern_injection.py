@@ -20,7 +20,7 @@ from typing import Literal, Protocol, runtime_checkable
 import numpy as np
 
 from hw.midplane.bracket import Placement
-from hw.midplane.search import Bench, PlacementError, Settings, Walker, Watch, coarse, procedure
+from hw.midplane.search import Bench, PlacementError, Settings, Walker, Watch, coarse
 from hw.runtime.errors import DeviceError
 from jaxcal import InputError
 from jaxcal.runtime.array_types import UInt8
@@ -255,41 +255,10 @@ def pattern_injection(
         SkippedError: by the operator.
         PlacementError: given up by a guard; the probe is at the last good place.
     """
-
-    def search(walker: Walker, start_mm: float) -> Placement:
-        settings = walker.settings
-        coarse(walker, start_mm)
-        first, message = len(walker.samples), ""
-        echoes = walker.listen()
-        for _ in range(_MOST_LOOKS):
-            if echoes.saturated(settings.full_scale):
-                raise PlacementError("the amplitude saturates: turn the gain down")
-            looks = walker.samples[first:]
-            loudest = max(peak for _, peak, _ in looks)
-            seen = tuple((at, bar_length(peak, loudest)) for at, peak, _ in looks)
-            view = View(seen, settings.fine_mm, frame, message, title)
-            lines = echoes.amplitude.shape[1]
-            injector.load_pattern(bar(view.length, echoes.loudest_line, lines))
-            injector.inject(True, _DELAY_TICKS)
-            decision = operator(view)
-            message = ""
-            if decision.what == "give-up":
-                raise SkippedError("the operator gave up the pose")
-            if decision.what == "accept":
-                low, high = flanks(seen, walker.where)
-                enough = all(sides_seen(seen)) and echoes.heard
-                if enough and low is not None and high is not None:
-                    lower, upper = 0.5 * sum(low), 0.5 * sum(high)
-                    spread = np.hypot(low[1] - low[0], high[1] - high[0]) / np.sqrt(48.0)
-                    spread = float(np.hypot(spread, settings.position_sd_mm / np.sqrt(2.0)))
-                    return walker.placement(0.5 * (lower + upper), 0.5 * (upper - lower), spread)
-                message = "visit both sides first: the bar must shrink on each"
-                continue
-            _, echoes = walker.stop_at(decision.offset_mm)
-        raise PlacementError(f"not accepted after {_MOST_LOOKS} looks")
-
     try:
-        placement = procedure(search)(bench, settings, start_mm, watch)
+        with Walker(bench, settings, watch) as walker:
+            coarse(walker, start_mm)
+            placement = _followed(walker, injector, operator, frame, title)
     except BaseException:
         # A person must read the first error, not one of switching off.
         with contextlib.suppress(DeviceError):
@@ -297,3 +266,42 @@ def pattern_injection(
         raise
     injector.inject(False)
     return placement
+
+
+def _followed(
+    walker: Walker,
+    injector: Injector,
+    operator: Operator,
+    frame: Callable[[], Frame | None],
+    title: str,
+) -> Placement:
+    """The placement when the operator accepts one; arguments as of :func:`pattern_injection`."""
+    settings = walker.settings
+    first, message = len(walker.samples), ""
+    echoes = walker.listen()
+    for _ in range(_MOST_LOOKS):
+        if echoes.saturated(settings.full_scale):
+            raise PlacementError("the amplitude saturates: turn the gain down")
+        looks = walker.samples[first:]
+        loudest = max(peak for _, peak, _ in looks)
+        seen = tuple((at, bar_length(peak, loudest)) for at, peak, _ in looks)
+        view = View(seen, settings.fine_mm, frame, message, title)
+        lines = echoes.amplitude.shape[1]
+        injector.load_pattern(bar(view.length, echoes.loudest_line, lines))
+        injector.inject(True, _DELAY_TICKS)
+        decision = operator(view)
+        message = ""
+        if decision.what == "give-up":
+            raise SkippedError("the operator gave up the pose")
+        if decision.what == "accept":
+            low, high = flanks(seen, walker.where)
+            enough = all(sides_seen(seen)) and echoes.heard
+            if enough and low is not None and high is not None:
+                lower, upper = 0.5 * sum(low), 0.5 * sum(high)
+                spread = np.hypot(low[1] - low[0], high[1] - high[0]) / np.sqrt(48.0)
+                spread = float(np.hypot(spread, settings.position_sd_mm / np.sqrt(2.0)))
+                return walker.placement(0.5 * (lower + upper), 0.5 * (upper - lower), spread)
+            message = "visit both sides first: the bar must shrink on each"
+            continue
+        _, echoes = walker.stop_at(decision.offset_mm)
+    raise PlacementError(f"not accepted after {_MOST_LOOKS} looks")

@@ -12,7 +12,6 @@ placement is given up.
 from __future__ import annotations
 
 import contextlib
-import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
@@ -171,37 +170,23 @@ class Settings:
         return Bracket(centre_mm, centre_mm - half, centre_mm + half, sd)
 
 
-@runtime_checkable
-class Procedure(Protocol):
-    """A way to place the probe, made by :func:`procedure`."""
-
-    def __call__(
-        self,
-        bench: Bench,
-        settings: Settings | None = None,
-        start_mm: float = 0.0,
-        watch: Watch | None = None,
-    ) -> Placement:
-        """Place the probe."""
-        ...
-
-
 class Walker:
-    """Moves and listens on behalf of one placement, and keeps its guards.
+    """Moves and listens on behalf of one placement, and keeps its guards; a context manager.
+
+    When a search within it gives up (:class:`PlacementError`), the probe is left at the last good
+    place. After any other error nothing is moved here.
 
     Args:
         bench: what to move and listen to.
-        settings: caps and steps.
+        settings: caps and steps; None: the default ones.
         watch: told of every stop.
     """
 
     def __init__(
-        self,
-        bench: Bench,
-        settings: Settings,
-        watch: Watch | None = None,
+        self, bench: Bench, settings: Settings | None = None, watch: Watch | None = None
     ) -> None:
-        self._bench, self.settings, self._watch = bench, settings, watch
+        self._bench, self._watch = bench, watch
+        self.settings = Settings() if settings is None else settings
         self._at: float | None = None
         self.where = 0.0
         self.good: float | None = None
@@ -210,6 +195,13 @@ class Walker:
         self.moves, self.travel_mm = 0, 0.0
         self.samples: list[tuple[float, float, int]] = []
         self.notes: list[str] = []
+
+    def __enter__(self) -> Walker:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is not None and issubclass(kind, PlacementError):
+            self._leave()
 
     def _move(self, offset: float) -> None:
         settings = self.settings
@@ -279,7 +271,7 @@ class Walker:
             "was: check the element, its threshold and the coupling"
         )
 
-    def leave(self) -> None:
+    def _leave(self) -> None:
         """Put the low threshold back and, if there is one, go to the last good place."""
         self.set_threshold(self.settings.low_threshold)
         if self.good is not None and self._at is not None and self._at != self.good:
@@ -300,35 +292,6 @@ class Walker:
         bracket = self.settings.bracket(middle_mm - self.where, half_mm, sd_mm)
         samples = np.array(self.samples, float).reshape(-1, 3)
         return Placement(bracket, self.where, self.moves, samples, tuple(self.notes))
-
-
-def procedure(search: Callable[[Walker, float], Placement]) -> Procedure:
-    """Make a procedure of a search by a :class:`Walker`.
-
-    The procedure takes a bench, settings (None: the default ones), where the mid-plane is expected
-    (an offset from the plan's pose, mm), and what is told of every stop. Its result is a placement
-    with the probe where the search has left it.
-
-    Raises:
-        PlacementError: the search's own, when it gives up: the probe is left at the last good
-            place. After any other error nothing is moved here.
-    """
-
-    @functools.wraps(search)
-    def placed(
-        bench: Bench,
-        settings: Settings | None = None,
-        start_mm: float = 0.0,
-        watch: Watch | None = None,
-    ) -> Placement:
-        walker = Walker(bench, Settings() if settings is None else settings, watch)
-        try:
-            return search(walker, start_mm)
-        except PlacementError:
-            walker.leave()
-            raise
-
-    return placed
 
 
 def coarse(walker: Walker, start_mm: float = 0.0) -> float:
@@ -360,9 +323,19 @@ def coarse(walker: Walker, start_mm: float = 0.0) -> float:
     )
 
 
-@procedure
-def first_seen(walker: Walker, start_mm: float) -> Placement:
+def first_seen(
+    bench: Bench,
+    settings: Settings | None = None,
+    start_mm: float = 0.0,
+    watch: Watch | None = None,
+) -> Placement:
     """No placement: stop as soon as the element is heard, as conventional practice would.
+
+    Args:
+        bench: what to move and listen to.
+        settings: how to search; None: the default ones.
+        start_mm: where the mid-plane is expected, as an offset from the plan's pose.
+        watch: told of every stop.
 
     Returns:
         A placement whose bracket reaches as far as the element may be heard.
@@ -370,6 +343,7 @@ def first_seen(walker: Walker, start_mm: float) -> Placement:
     Raises:
         PlacementError: it is heard nowhere.
     """
-    coarse(walker, start_mm)
-    half = walker.settings.beam_half_mm
-    return walker.placement(walker.where, half, half / np.sqrt(3.0))
+    with Walker(bench, settings, watch) as walker:
+        coarse(walker, start_mm)
+        half = walker.settings.beam_half_mm
+        return walker.placement(walker.where, half, half / np.sqrt(3.0))
