@@ -21,6 +21,7 @@ from jaxcal import CalibrationError, InputError
 from jaxcal.data.recording import MINIMUM_IMAGES, MetresError, check_pose_units
 from jaxcal.io.untrusted import UpTo
 from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.messages import command_line
 
 _IMAGES = UpTo(100_000, "images")
 
@@ -99,10 +100,11 @@ class Run(ABC):
             reason, interrupted = "interrupted", True
         except (DeviceError, CalibrationError) as error:
             reason, interrupted = str(error), False
-        count, kept = len(self.kept), self.recorder.kept
-        raise FreeHandStopped(
-            reason, count, self.asked, kept, *self.options, interrupted=interrupted
-        )
+        asked, path = self.asked, self.recorder.kept
+        server = f"{asked.host}:{asked.port}"
+        again = command_line(["jaxcal-hw", "free-hand", server, path, *self.options, "--resume"])
+        state = f"{reason}; {len(self.kept)} of {asked.images} images are in {path}"
+        raise FreeHandStopped(f"{state}; go on with: {again}", interrupted=interrupted)
 
     def _go(self) -> int:
         self.begin()
