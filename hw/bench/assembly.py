@@ -126,7 +126,20 @@ class Assembly:
             seed=options.seed,
         )
         self.robot: RobotProcess | None = None
-        self._faults = self._table()
+        echo, images = self.echo, self.images
+        self._faults: dict[str, Callable[..., object]] = {
+            "crc_errors": lambda rate: echo.fault(crc_errors=float(rate)),
+            "miss_triggers": lambda rate: echo.fault(missed_triggers=float(rate)),
+            "miss_lines": lambda rate: echo.fault(missed_lines=float(rate)),
+            "echo_stale": lambda: echo.fault(stale=True),
+            "echo_mute": lambda: echo.fault(mute=True),
+            "unplug": echo.unplug,
+            "replug": echo.replug,
+            "image_stale": lambda: images.fault(stale=True),
+            "image_freeze": lambda: images.fault(frozen=True),
+            "image_drop": images.drop,
+            "image_corrupt": lambda rate: images.fault(corrupt=float(rate)),
+        }
         self._unplugged = False
         self._done: queue.SimpleQueue[None] = queue.SimpleQueue()
         self.control = ControlServer(
@@ -230,22 +243,6 @@ class Assembly:
         self._done.put(None)
 
     # Requests
-
-    def _table(self) -> dict[str, Callable[..., object]]:
-        echo, images = self.echo, self.images
-        return {
-            "crc_errors": lambda rate: echo.fault(crc_errors=float(rate)),
-            "miss_triggers": lambda rate: echo.fault(missed_triggers=float(rate)),
-            "miss_lines": lambda rate: echo.fault(missed_lines=float(rate)),
-            "echo_stale": lambda: echo.fault(stale=True),
-            "echo_mute": lambda: echo.fault(mute=True),
-            "unplug": echo.unplug,
-            "replug": echo.replug,
-            "image_stale": lambda: images.fault(stale=True),
-            "image_freeze": lambda: images.fault(frozen=True),
-            "image_drop": images.drop,
-            "image_corrupt": lambda rate: images.fault(corrupt=float(rate)),
-        }
 
     def _fault(self, name: str = "", **request: object) -> float:
         """Bench time at which the fault was in force."""
