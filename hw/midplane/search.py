@@ -148,11 +148,6 @@ class Settings:
         if not 0 < self.top_fraction < 1:
             raise InputError("search: top_fraction must be between 0 and 1")
 
-    @property
-    def hidden_sd_mm(self) -> float:
-        """SD of the errors that no search sees: response's shift, last stop's repeatability; mm."""
-        return float(np.hypot(self.response_sd_mm, self.position_sd_mm))
-
     def bracket(self, centre_mm: float, half_mm: float, sd_mm: float) -> Bracket:
         """A bracket from what a search found and the independent errors that it cannot see.
 
@@ -165,8 +160,9 @@ class Settings:
             Its ends: their distance from the centre is the root of the summed squares of
             ``half_mm`` and of ``factor`` times the SD of the hidden errors.
         """
-        half = float(np.hypot(half_mm, self.factor * self.hidden_sd_mm))
-        sd = float(np.hypot(sd_mm, self.hidden_sd_mm))
+        # The response's shift, and the last stop's repeatability.
+        hidden = np.hypot(self.response_sd_mm, self.position_sd_mm)
+        half, sd = float(np.hypot(half_mm, self.factor * hidden)), float(np.hypot(sd_mm, hidden))
         return Bracket(centre_mm, centre_mm - half, centre_mm + half, sd)
 
 

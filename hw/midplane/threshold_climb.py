@@ -27,24 +27,14 @@ class Edges:
     """Where the response begins and ends at one threshold, mm.
 
     Attributes:
-        low_mm: where it begins.
-        high_mm: where it ends.
+        middle_mm: half way between.
+        half_mm: half of the stretch.
         sd_mm: standard deviation of the middle.
     """
 
-    low_mm: float
-    high_mm: float
+    middle_mm: float
+    half_mm: float
     sd_mm: float
-
-    @property
-    def middle_mm(self) -> float:
-        """Half way between."""
-        return 0.5 * (self.low_mm + self.high_mm)
-
-    @property
-    def half_mm(self) -> float:
-        """Half of the stretch."""
-        return 0.5 * (self.high_mm - self.low_mm)
 
 
 def find_edges(walker: Walker, middle_mm: float, half_mm: float) -> Edges | None:
@@ -84,7 +74,7 @@ def find_edges(walker: Walker, middle_mm: float, half_mm: float) -> Edges | None
     # From mean and number of the heard stops: random errors of the stops cancel in both.
     middle, half = float(np.mean(heard)), 0.5 * step * len(heard)
     spread = np.hypot(step / np.sqrt(24.0), settings.position_sd_mm / np.sqrt(2.0))
-    return Edges(middle - half, middle + half, float(spread))
+    return Edges(middle, half, float(spread))
 
 
 def climb(walker: Walker, peak: Peak) -> Edges:
