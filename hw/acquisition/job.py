@@ -18,7 +18,6 @@ from hw.recording.resuming import (
     compare,
     described,
     described_electronics,
-    described_probe,
 )
 from hw.recording.session import Session
 from hw.robot.identity import LOCAL
@@ -93,7 +92,7 @@ def open_recorder(path: str | os.PathLike[str], job: Job) -> Recorder:
     probe = job.setup.probe
     header = RecordingHeader(
         kind=job.request.kind,
-        probe={"kind": probe.kind, **described_probe(probe)},
+        probe={"kind": probe.kind, **asdict(probe)},
         lines=probe.elements,
         settings=json.dumps(
             {"request": asdict(job.request), "bench": described(job.setup, job.targets)}

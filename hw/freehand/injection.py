@@ -40,7 +40,6 @@ from hw.recording.resuming import (
     check_same,
     compare_electronics,
     described_electronics,
-    described_probe,
 )
 from hw.recording.session import DELAY_S, Watch, median_times
 from hw.runtime.errors import DeviceError, StaleError
@@ -120,7 +119,7 @@ def acquire_by_injection(
         asked, told = recorded_request(path, _KIND, asked)
         known, before = devices_of(path)
         with naming(path):
-            check_same("probe", known, described_probe(probe))
+            check_same("probe", known, asdict(probe))
             check_same("scene", told.get("scene"), _scene(setup))
         kept = KeptImages(read_images(path))
     with contextlib.ExitStack() as stack:
@@ -152,7 +151,7 @@ def _recorder(
     known = {**asked.settings(posed.pair), "scene": _scene(setup), "search": asdict(setup.search)}
     header = RecordingHeader(
         kind="time_of_flight",
-        probe={"kind": probe.kind, **described_probe(probe)},
+        probe={"kind": probe.kind, **asdict(probe)},
         lines=probe.elements,
         settings=json.dumps({_KIND: known}),
     )
