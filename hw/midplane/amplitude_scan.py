@@ -111,7 +111,7 @@ def scan_up(walker: Walker, start_mm: float, step_mm: float) -> Peak:
     offset = middle - 1.4 * width
     where, echoes = walker.stop_at(offset)
     # The coarse steps may be wrong: go down until the scan begins on the lower skirt.
-    loudest = max(echoes.peak, max(amplitude for _, amplitude, _ in walker.samples))
+    loudest = max(amplitude for _, amplitude, _ in walker.samples)
     while echoes.peak > LEAST_FRACTION * loudest:
         offset -= width
         where, echoes = walker.stop_at(offset)
@@ -136,19 +136,15 @@ def scan_up(walker: Walker, start_mm: float, step_mm: float) -> Peak:
 
 def _overview(walker: Walker, start_mm: float) -> tuple[float, float]:
     """Middle and SD (mm) of the beam, roughly, from half coarse steps up until it fades."""
-    settings = walker.settings
-    places: list[float] = []
-    loud: list[float] = []
-    offset = start_mm
+    settings, first = walker.settings, len(walker.samples)
+    loudest, offset = 0.0, start_mm
     while True:
-        where, echoes = walker.stop_at(offset)
-        places.append(where)
-        loud.append(echoes.peak)
-        faded = echoes.peak < LEAST_FRACTION * max(loud)
-        if (faded and max(loud) > 0) or offset > start_mm + settings.span_mm:
+        _, echoes = walker.stop_at(offset)
+        loudest = max(loudest, echoes.peak)
+        if echoes.peak < LEAST_FRACTION * loudest or offset > start_mm + settings.span_mm:
             break
         offset += 0.5 * settings.coarse_mm
-    x, level = np.array(places), np.array(loud)
+    x, level, _ = np.array(walker.samples[first:]).T
     best = int(np.argmax(level))
     if level[best] == 0:
         walker.recover()

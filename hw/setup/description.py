@@ -264,7 +264,8 @@ def _setup(tables: dict[str, Any]) -> Setup:
         if not all(1.0 <= value <= FURTHEST_TIP_MM for value in housing):
             raise InputError(f"[probe] housing_mm must be 1 to {FURTHEST_TIP_MM:g} mm each")
     echo = found["active_echo"]
-    if not 1 <= echo.get("frames", 9) <= 1000:
+    frames = echo.get("frames", Setup.frames)
+    if not 1 <= frames <= 1000:
         raise InputError("[active_echo] frames must be 1 to 1000")
     plan = {
         key: _as_tuple(_numbers(key, value, _PLAN_SHAPES[key], "plan").tolist())
@@ -274,7 +275,7 @@ def _setup(tables: dict[str, Any]) -> Setup:
     }
     setup = Setup(
         active_echo_url=echo["url"],
-        frames=echo.get("frames", 9),
+        frames=frames,
         ultrasound=ultrasound,
         scene=Scene(
             _drawn(scene["image_to_probe"]),
