@@ -35,7 +35,8 @@ HOST = "127.0.0.77"
 def serve(controller: int) -> None:
     """The bench's process: says where everything is, and at the end what it could not send."""
     from hw.bench.active_echo import AuspisEmulator
-    from hw.bench.rtde import Arm, RtdeServer
+    from hw.bench.arm import Arm
+    from hw.bench.rtde import RtdeServer
     from hw.bench.ultrasound import ImageServer
 
     rng = np.random.default_rng(SEED)

@@ -42,9 +42,7 @@ SECONDS, QUICK_SECONDS = 30.0, 5.0
 BAR = 0.1
 HEADER = ["pages", "rate_hz", "seconds", "messages", "left_out", "feeder_cores", "server_cores",
           "both_cores"]  # fmt: skip
-PLACEMENT = Placement(
-    "none", Bracket(0.1, -0.7, 0.9, 0.3), 0.1, 800.0, 100, 3, 1.0, 9, np.zeros((0, 3))
-)
+PLACEMENT = Placement(Bracket(0.1, -0.7, 0.9, 0.3), 0.1, 3, np.zeros((0, 3)))
 
 
 def cpu_s(pid: int) -> float:

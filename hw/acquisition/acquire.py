@@ -219,15 +219,6 @@ def _closing(recorder: Recorder) -> Iterator[None]:
             recorder.close()
 
 
-@dataclass(frozen=True)
-class _Shot:
-    """What was measured at the place where the probe stands."""
-
-    pose: np.ndarray
-    measurement: np.ndarray
-    amplitude: float
-
-
 @dataclass
 class _Run:
     """One way through a job; arguments as of :func:`acquire`."""
@@ -397,8 +388,10 @@ class _Run:
                 )
         return first_seen(stage, settings, 0.0, watch=watch)
 
-    def _shoot(self, row: int, stage: ProbeStage, session: Session) -> _Shot:
-        """Average the pose, and listen or look.
+    def _shoot(
+        self, row: int, stage: ProbeStage, session: Session
+    ) -> tuple[np.ndarray, np.ndarray, float]:
+        """Average the pose, and listen or look; the pose, the measurement and its amplitude.
 
         Raises:
             PlacementError: no frame shows a credible target.
@@ -413,25 +406,31 @@ class _Run:
             measurement, amplitude = median_times(heard)
         stage.check()
         session.record_image()
-        return _Shot(pose, measurement, amplitude)
+        return pose, measurement, amplitude
 
-    def _select(self, row: int, placement: Placement, shot: _Shot, began: float) -> None:
+    def _select(
+        self,
+        row: int,
+        placement: Placement,
+        shot: tuple[np.ndarray, np.ndarray, float],
+        began: float,
+    ) -> None:
         """Put the image among those of the calibration, and solve again."""
         clock, bracket, emulated = self.clock, placement.bracket, self.emulated
+        pose, measurement, amplitude = shot
         self.recorder.add_selected(
-            shot.pose,
-            shot.measurement,
+            pose,
+            measurement,
             kind=self.job.request.kind,
-            max_elevation=bracket.max_elevation_mm,
-            amplitude=shot.amplitude,
+            amplitude=amplitude,
             t_host=clock.now(),
             target=row,
-            bracket=(bracket.centre_mm, bracket.low_mm, bracket.high_mm, bracket.sd_mm),
+            bracket=bracket,
             offset=placement.offset_mm,
             true_elevation=float("nan") if emulated is None else emulated.elevation_mm(),
             seconds=clock.now() - began,
         )
-        estimate = self.estimator.add(shot.pose, shot.measurement, bracket.max_elevation_mm)
+        estimate = self.estimator.add(pose, measurement, bracket.max_elevation_mm)
         if estimate is not None:
             self.recorder.add_estimate(t_host=clock.now(), **estimate)
 

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 
 from hw.acquisition.request import AcquisitionRequest, planned, request_in
-from hw.recording.check import Progress, is_complete, read_progress
+from hw.recording.check import Progress, check_resumable, read_progress
 from hw.recording.file import RecordingWriter
 from hw.recording.layout import RecordingHeader
 from hw.recording.recorder import Recorder
@@ -18,7 +18,6 @@ from hw.recording.resuming import (
     compare,
     described,
     described_electronics,
-    described_probe,
 )
 from hw.recording.session import Session
 from hw.robot.identity import LOCAL
@@ -75,7 +74,7 @@ def prepare(setup: Setup, path: str | os.PathLike[str], request: AcquisitionRequ
     """
     if request is not None:
         return Job(setup, request, planned(setup, request).poses, None)
-    if not is_complete(path):
+    if not check_resumable(path):
         # Cut the file back to whole rows first, so that only these are read.
         RecordingWriter.resume(path).close()
     progress = read_progress(path)
@@ -93,7 +92,7 @@ def open_recorder(path: str | os.PathLike[str], job: Job) -> Recorder:
     probe = job.setup.probe
     header = RecordingHeader(
         kind=job.request.kind,
-        probe={"kind": probe.kind, **described_probe(probe)},
+        probe={"kind": probe.kind, **asdict(probe)},
         lines=probe.elements,
         settings=json.dumps(
             {"request": asdict(job.request), "bench": described(job.setup, job.targets)}

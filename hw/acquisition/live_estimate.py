@@ -11,6 +11,7 @@ from hw.midplane.bracket import Placement
 from hw.recording.check import Progress
 from hw.setup.description import Setup
 from jaxcal import InputError
+from jaxcal.data.poses import targets_in_images
 from jaxcal.data.recording import Kind
 from jaxcal.result.calibration import Calibration
 
@@ -38,13 +39,14 @@ class Estimator:
         self._setup, self._capacity = setup, capacity
         self._kind: Kind = "point" if kind == "point" else "time_of_flight"
         self._live = self._empty()
-        self._result: Calibration | None = None
+        self.answer: Calibration | None = None
+        """The calibration from the images so far; None with too few."""
         self._left_out = 0
         if progress is not None:
             rows = zip(progress.poses, progress.measurements, progress.max_elevation, strict=True)
             for pose, measurement, bound in rows:
                 self._put(pose, measurement, bound)
-            self._result = self._solve()
+            self.answer = self._solve()
 
     def _empty(self) -> LiveCalibration:
         return LiveCalibration(
@@ -61,18 +63,12 @@ class Estimator:
         """(n, 4, 4) of the images that the calibration takes, mm, in the order of its arrays."""
         return self._live.poses
 
-    @property
-    def answer(self) -> Calibration | None:
-        """The calibration from the images so far; None with too few."""
-        return self._result
-
     def warm_up(self, targets: np.ndarray) -> None:
         """Compile before anything moves, on measurements simulated from drawing and plan."""
         live, probe, scene = self._empty(), self._setup.probe, self._setup.scene
-        seen = np.linalg.inv(targets @ scene.image_to_probe) @ np.append(scene.point_mm, 1.0)
         # Slightly off the plane, like real images: an exact fit would be a degenerate problem.
         rng = np.random.default_rng(0)
-        seen = seen[:, :3] + rng.normal(0, 0.2, (len(targets), 3))
+        seen = scene.expected(targets) + rng.normal(0, 0.2, (len(targets), 3))
         if self._kind == "point":
             measured = np.column_stack([seen[:, 0], np.hypot(seen[:, 1], seen[:, 2])])
             measured += rng.normal(0, 0.1, measured.shape)
@@ -86,10 +82,10 @@ class Estimator:
     def add(self, pose: np.ndarray, measurement: np.ndarray, bound: float) -> dict[str, Any] | None:
         """Take an image and solve; a row of /estimate, or None with too few images."""
         if self._put(pose, measurement, bound):
-            self._result = self._solve()
-        if self._result is None:
+            self.answer = self._solve()
+        if self.answer is None:
             return None
-        answer = self._result.numpy()
+        answer = self.answer.numpy()
         return {
             "images": answer.mask.sum(),
             "image_to_probe": answer.image_to_probe,
@@ -105,29 +101,29 @@ class Estimator:
 
         0 where nothing is known yet.
         """
-        if self._result is None or self._result.status != "converged":
+        if self.answer is None or self.answer.status != "converged":
             return 0.0
-        answer = self._result.numpy()
-        seen = np.linalg.inv(pose @ answer.image_to_probe) @ np.append(answer.point, 1.0)
-        return float(seen[1])
+        answer = self.answer.numpy()
+        return float(targets_in_images(pose, answer.image_to_probe, answer.point)[1])
 
     def line(self, total: int, placement: Placement) -> str:
         """The state of the acquisition after an image, for a person."""
         bracket = placement.bracket
-        head = (
+        placed = (
             f"image {self.count}/{total}: offset {bracket.centre_mm:+.2f} mm in "
             f"[{bracket.low_mm:+.2f}, {bracket.high_mm:+.2f}], {placement.moves} moves"
         )
-        if self._result is None:
+        head = "; ".join([placed, *placement.notes])
+        if self.answer is None:
             return f"{head}; no estimate yet"
-        answer = self._result.numpy()
+        answer = self.answer.numpy()
         x, y, z = answer.image_to_probe[:3, 3]
         head += f"; X at ({x:.2f}, {y:.2f}, {z:.2f}) mm"
         if np.isfinite(answer.covariance).all():
             mm = float(np.sqrt(np.trace(answer.covariance[:3, :3])))
             degrees = float(np.degrees(np.sqrt(np.trace(answer.covariance[3:, 3:]))))
             head += f" +- {mm:.2f} mm, {degrees:.2f} deg (SD)"
-        return f"{head}; RMS {float(answer.rms):.2f} mm; {self._result.status}"
+        return f"{head}; RMS {float(answer.rms):.2f} mm; {self.answer.status}"
 
     def _put(self, pose: np.ndarray, measurement: np.ndarray, bound: float) -> bool:
         """Whether the calibration takes the image."""

@@ -82,7 +82,7 @@ class Planner:
         self,
         open_rows: list[int],
         taken: Float[np.ndarray, "k 4 4"],
-        here: Float[np.ndarray, "4 4"] | None,
+        here: Float[np.ndarray, "4 4"],
         answer: Calibration | None,
     ) -> Choice:
         """The next pose of the pool, or none where the wanted error is reached.
@@ -90,12 +90,12 @@ class Planner:
         Args:
             open_rows: poses that were neither taken nor given up; at least one.
             taken: (k, 4, 4) tracked poses of the images that the calibration takes.
-            here: where the tool centre point is; None: not known.
+            here: where the tool centre point is.
             answer: the calibration from these images.
         """
         left = replace(self._nominal, poses=self._targets[open_rows], taken=taken)
         known, left = self._known(answer, left)
-        cost = None if here is None else self._seconds(here, left.poses)
+        cost = self._seconds(here, left.poses)
         fills = (len(taken) + 1) % _FILL == 0
         rules = replace(BENCH_RULES, space_filling=float(fills))
         found = next_poses(known, left, 1, cost_s=cost, rules=rules)

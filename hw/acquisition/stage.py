@@ -56,7 +56,8 @@ class ProbeStage:
         self._session, self._motion, self._note = session, motion, note
         self._axis = np.asarray(session.setup.scene.elevational, float)
         self.plan_pose = np.eye(4)
-        self._arrived = session.clock.now()
+        self.arrived_s = session.clock.now()
+        """Bench time since which neither the probe nor the threshold has changed."""
         self._rests_at: np.ndarray | None = None
         """Pose in which the last move ended."""
 
@@ -114,7 +115,7 @@ class ProbeStage:
             DeviceError: motion has ended, or a device is in lasting trouble.
         """
         self._motion.check()
-        heard = self._session.listen(frames, self._arrived)
+        heard = self._session.listen(frames, self.arrived_s)
         answered = np.array([np.isfinite(frame.tof_s) for frame in heard])
         amplitude = np.array([frame.amplitude for frame in heard], float)
         return Echoes(np.where(answered, amplitude, 0.0), answered)
@@ -122,7 +123,7 @@ class ProbeStage:
     def set_threshold(self, threshold: int) -> None:
         """Set the threshold, counts; frames that began under another one are not read any more."""
         self._session.echo.set_threshold(threshold)
-        self._arrived = self._session.clock.now()
+        self.arrived_s = self._session.clock.now()
 
     def load_pattern(self, pattern: bytes) -> None:
         """Load a pattern: a level (0 to 255) for each line."""
@@ -150,7 +151,7 @@ class ProbeStage:
             DeviceError: motion has ended, or no images come.
         """
         self._motion.check()
-        return self._session.image_after(self._arrived + IMAGE_AGE_S)
+        return self._session.image_after(self.arrived_s + IMAGE_AGE_S)
 
     def image_bench(self, row: int, *, credible: bool = False) -> ImageBench:
         """The bench of the procedures for a phantom that only shows in the image.
@@ -246,11 +247,6 @@ class ProbeStage:
             )
         return pose
 
-    @property
-    def arrived_s(self) -> float:
-        """Bench time since which neither the probe nor the threshold has changed."""
-        return self._arrived
-
     def _move(self, pose: np.ndarray) -> PoseSample:
         for hesitation in range(_MOST_HESITATIONS + 1):
             self._session.wait_until_clear()
@@ -261,6 +257,6 @@ class ProbeStage:
                     raise
                 self._note("hesitation", str(error))
                 continue
-            self._arrived, self._rests_at = self._session.clock.now(), sample.pose
+            self.arrived_s, self._rests_at = self._session.clock.now(), sample.pose
             return sample
         raise AssertionError

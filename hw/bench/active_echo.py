@@ -92,6 +92,7 @@ class AuspisEmulator:
 
     Attributes:
         path: what to open, a path or ``socket://host:port``.
+        threshold: in force, counts.
         injection: what the element answers with; replaced as a whole.
         sent: frames put on the line.
         refused: frames dropped because the line's buffer was full.
@@ -121,7 +122,7 @@ class AuspisEmulator:
         self._inbox = bytearray()
         self._errors: deque[str] = deque(maxlen=16)
         self._faults = EchoFaults()
-        self._threshold = 0
+        self.threshold = 0
         self._streaming = False
         self._first_frame = first_frame
         self._frames, self._line_triggers = first_frame, 0
@@ -133,11 +134,6 @@ class AuspisEmulator:
         self.injection = Injection()
         self.sent = 0
         self.refused = 0
-
-    @property
-    def threshold(self) -> int:
-        """Threshold in force, counts."""
-        return self._threshold
 
     def start(self) -> AuspisEmulator:
         """Begin to listen."""
@@ -185,7 +181,7 @@ class AuspisEmulator:
             host, port = self.path.removeprefix("socket://").split(":")
             self._link = TcpLink(host, int(port))
         self._faults, self.injection = EchoFaults(), Injection()
-        self._threshold, self._streaming = 0, False
+        self.threshold, self._streaming = 0, False
         self._frames, self._line_triggers = self._first_frame, 0
         self._inbox.clear()
         self._unplug, self._plugged = False, True
@@ -235,12 +231,12 @@ class AuspisEmulator:
         self._line_triggers += lines
         if not self._streaming or faults.mute or self._random.random() < faults.missed_triggers:
             return
-        seconds, amplitude = self._echo(t, self._threshold)
+        seconds, amplitude = self._echo(t, self.threshold)
         clock_hz = self._clock_hz * faults.clock
         packet = EchoPacket(
             frame=frame % 2**32,
             ticks=int(t * clock_hz) % 2**64,
-            threshold=self._threshold,
+            threshold=self.threshold,
             tof_ticks=to_ticks(seconds, clock_hz)[:lines],
             amplitude=np.clip(np.nan_to_num(np.rint(amplitude)), 0, 0xFFFF).astype(np.uint16)[
                 :lines
@@ -292,11 +288,11 @@ class AuspisEmulator:
             case "CLK?":
                 return f"{self._clock_hz:.0f}"
             case "THR?":
-                return str(self._threshold)
+                return str(self.threshold)
             case "TRIG:COUN?":
                 return f"{self._line_triggers},{self._frames}"
             case "THR" if _within(argument, MAXIMUM_THRESHOLD):
-                self._threshold = int(argument)
+                self.threshold = int(argument)
                 return argument
             case "INJ:DEL" if _within(argument, 0xFFFF):
                 self.injection = replace(self.injection, delay_ticks=int(argument))

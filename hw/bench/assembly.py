@@ -126,7 +126,20 @@ class Assembly:
             seed=options.seed,
         )
         self.robot: RobotProcess | None = None
-        self._faults = self._table()
+        echo, images = self.echo, self.images
+        self._faults: dict[str, Callable[..., object]] = {
+            "crc_errors": lambda rate: echo.fault(crc_errors=float(rate)),
+            "miss_triggers": lambda rate: echo.fault(missed_triggers=float(rate)),
+            "miss_lines": lambda rate: echo.fault(missed_lines=float(rate)),
+            "echo_stale": lambda: echo.fault(stale=True),
+            "echo_mute": lambda: echo.fault(mute=True),
+            "unplug": echo.unplug,
+            "replug": echo.replug,
+            "image_stale": lambda: images.fault(stale=True),
+            "image_freeze": lambda: images.fault(frozen=True),
+            "image_drop": images.drop,
+            "image_corrupt": lambda rate: images.fault(corrupt=float(rate)),
+        }
         self._unplugged = False
         self._done: queue.SimpleQueue[None] = queue.SimpleQueue()
         self.control = ControlServer(
@@ -134,13 +147,13 @@ class Assembly:
                 "fault": self._fault,
                 "recover": self._recover,
                 "truth": self._truth,
-                "true_pose": lambda _: self.true_pose(self.clock.now()).tolist(),
-                "rest_since": lambda _: self._rest_since(),
-                "world": lambda _: self._world(),
-                "test_set": self._test_set,
-                "statistics": lambda _: self._statistics(),
-                "robot": lambda _: self._robot(),
-                "close": lambda _: self._done.put(None),
+                "true_pose": lambda: self.true_pose(self.clock.now()).tolist(),
+                "rest_since": self._rest_since,
+                "world": self._world,
+                "test_set": lambda **of: [part.tolist() for part in self.world.test_set(**of)],
+                "statistics": self._statistics,
+                "robot": self._robot,
+                "close": self.end,
             }
         )
 
@@ -231,25 +244,8 @@ class Assembly:
 
     # Requests
 
-    def _table(self) -> dict[str, Callable[..., object]]:
-        echo, images = self.echo, self.images
-        return {
-            "crc_errors": lambda rate: echo.fault(crc_errors=float(rate)),
-            "miss_triggers": lambda rate: echo.fault(missed_triggers=float(rate)),
-            "miss_lines": lambda rate: echo.fault(missed_lines=float(rate)),
-            "echo_stale": lambda: echo.fault(stale=True),
-            "echo_mute": lambda: echo.fault(mute=True),
-            "unplug": echo.unplug,
-            "replug": echo.replug,
-            "image_stale": lambda: images.fault(stale=True),
-            "image_freeze": lambda: images.fault(frozen=True),
-            "image_drop": images.drop,
-            "image_corrupt": lambda rate: images.fault(corrupt=float(rate)),
-        }
-
-    def _fault(self, request: dict) -> float:
+    def _fault(self, name: str = "", **request: object) -> float:
         """Bench time at which the fault was in force."""
-        name = request.pop("name", None)
         if name in _OF_THE_ROBOT:
             assert self.robot is not None
             wanted = _OF_THE_ROBOT[name]
@@ -264,7 +260,7 @@ class Assembly:
             self._unplugged = True
         return self.clock.now()
 
-    def _recover(self, _: dict) -> None:
+    def _recover(self) -> None:
         """End the devices' faults. A protective stop and changes at the pendant stay."""
         if self.robot is not None:
             self.robot.ask("unmute")
@@ -274,9 +270,9 @@ class Assembly:
         self.echo.recover()
         self.images.recover()
 
-    def _truth(self, request: dict) -> list:
-        poses = np.asarray(request["pose"], float).reshape(-1, 4, 4)
-        places = [self.world.truth(pose) for pose in poses]
+    def _truth(self, pose: list) -> list:
+        poses = np.asarray(pose, float).reshape(-1, 4, 4)
+        places = [self.world.truth(each) for each in poses]
         return [[place.lateral_mm, place.range_mm, place.elevation_mm] for place in places]
 
     def _rest_since(self) -> float | None:
@@ -290,10 +286,6 @@ class Assembly:
             "sound_speed_m_s": self.world.sound_speed_m_s,
             "latency_s": self.world.noise.latency_s,
         }
-
-    def _test_set(self, request: dict) -> list:
-        poses, points = self.world.test_set(**request)
-        return [poses.tolist(), points.tolist()]
 
     def _robot(self) -> dict:
         """Whether the controller's program runs, and why it last stopped."""

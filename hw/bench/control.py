@@ -21,7 +21,8 @@ _MOST_CONNECTIONS = 8
 _TIMEOUT_S = 30.0
 """Wall seconds for connecting and for an answer."""
 
-Handler = Callable[[dict], object]
+Handler = Callable[..., object]
+"""Takes what stands beside ``do`` in the request, by its names."""
 
 
 class ControlServer:
@@ -80,7 +81,7 @@ class ControlServer:
             request = json.loads(line)
             if not isinstance(request, dict) or request.get("do") not in self._handlers:
                 return {"error": f"unknown request; there are: {', '.join(self._handlers)}"}
-            return {"ok": self._handlers[request.pop("do")](request)}
+            return {"ok": self._handlers[request.pop("do")](**request)}
         except Exception as error:
             return {"error": " ".join(f"{type(error).__name__}: {error}".split())}
 

@@ -23,6 +23,7 @@ import numpy as np
 
 from hw.bench.tank import ELEMENT_MM, Look, Pose, Tank
 from jaxcal import InputError
+from jaxcal.data.poses import targets_in_images
 from jaxcal.runtime.array_types import Float
 
 _RANGE_OF_PEAK_MM = 20.0
@@ -146,12 +147,7 @@ class ActiveEcho(Sensor):
     reflection for the element. It is 2 mm wide: the place on it that hears the most moves with the
     direction of the sound (:meth:`hw.bench.world.World.shift_mm`), and its mark is wider than a
     point's.
-
-    Attributes:
-        size_mm: outer diameter.
     """
-
-    size_mm: float = ELEMENT_MM
 
     name = "active-echo"
     answers = True
@@ -226,7 +222,7 @@ class CrossWire(Phantom):
     ) -> list[Mark]:
         """The pieces of both wires within the thickness of the beam."""
         x = world.image_to_probe
-        crossing = world.target_of(pose, world.point_mm + np.asarray(self.beside_mm))
+        crossing = targets_in_images(pose, x, world.point_mm + np.asarray(self.beside_mm))
         if crossing[2] <= 0:
             return []
         scatter = SCATTER_MM * np.array([world.field(pose, 1), world.field(pose, 2)])

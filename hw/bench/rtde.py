@@ -46,8 +46,6 @@ from hw.robot.kinematics import MODELS
 from hw.runtime.clock import REAL, Clock
 from hw.runtime.processes import ANSWERS, be_prompt
 
-__all__ = ["Arm", "RtdeServer"]
-
 DASHBOARD, PRIMARY, SCRIPT, RTDE = DASHBOARD_PORT, PRIMARY_PORT, 30003, 30004
 _MAX_WAITING = 1 << 16
 """Bytes that may wait for a client that does not read; further packets for it are dropped."""

@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import queue
 import subprocess
 import sys
 import tempfile
@@ -24,7 +23,7 @@ from hw.bench.assembly import Assembly, BenchOptions
 from hw.bench.control import ControlClient
 from hw.planning.scene import Scene
 from hw.runtime.clock import Clock
-from hw.runtime.processes import finish, spawn
+from hw.runtime.processes import finish, first_line, spawn
 from jaxcal import InputError
 from jaxcal.data.probe import LinearProbe
 from jaxcal.runtime.array_types import Float
@@ -160,8 +159,7 @@ def start_bench(**options: Any) -> Bench:
     with tempfile.TemporaryFile() as complaints:
         options_text = json.dumps(asdict(chosen))
         process = spawn("hw.bench.run", options_text, stdin=True, stderr=complaints)
-        assert process.stdout is not None
-        line = _first_line(process)
+        line = first_line(process, _START_WALL_S)
         if not line:
             process.kill()
             process.communicate()
@@ -169,18 +167,6 @@ def start_bench(**options: Any) -> Bench:
             said = complaints.read(1 << 16).decode(errors="replace").strip().splitlines()
             raise InputError(f"the bench did not start: {said[-1] if said else 'no reason given'}")
     return Bench(process, json.loads(line))
-
-
-def _first_line(process: subprocess.Popen) -> bytes:
-    """The first line that it prints; empty if that takes too long."""
-    lines: queue.SimpleQueue[bytes] = queue.SimpleQueue()
-    stdout = process.stdout
-    assert stdout is not None
-    threading.Thread(target=lambda: lines.put(stdout.readline()), daemon=True).start()
-    try:
-        return lines.get(timeout=_START_WALL_S)
-    except queue.Empty:
-        return b""
 
 
 def serve(options: BenchOptions, *, of_parent: bool = False) -> None:

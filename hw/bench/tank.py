@@ -11,6 +11,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from hw.planning.scene import Scene
+from jaxcal.data.poses import targets_in_images
 from jaxcal.data.probe import L14_5, LinearProbe
 from jaxcal.runtime.array_types import Float
 
@@ -164,14 +165,8 @@ class Tank:
     seed: int = 0
 
     def target(self, pose: Pose) -> Float[np.ndarray, " 3"]:
-        """The target in the image frame: q = X^-1 B^-1 c, mm."""
-        return self.target_of(pose, self.point_mm)
-
-    def target_of(self, pose: Pose, point_mm: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
-        """Any point of the base frame in the image frame, mm."""
-        x = self.image_to_probe
-        in_tool = (point_mm - pose[:3, 3]) @ pose[:3, :3]
-        return (in_tool - x[:3, 3]) @ x[:3, :3]
+        """The target in the image frame, mm."""
+        return targets_in_images(pose, self.image_to_probe, self.point_mm)
 
     def truth(self, pose: Pose) -> Place:
         """Where the target truly is when the tool centre point is at ``pose``."""

@@ -12,6 +12,7 @@ import socket
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -231,24 +232,17 @@ class ImageServer:
     def _serve(self, client: _Client) -> None:
         """Send as much as the client takes; what the client sends is ignored."""
         try:
-            while client.pending:
-                sent = client.connection.send(client.pending[0])
-                client.size -= sent
-                if sent < len(client.pending[0]):
-                    client.pending[0] = client.pending[0][sent:]
-                else:
-                    client.pending.popleft()
-        except BlockingIOError:
-            pass
-        except OSError:
-            self._leave(client)
-            return
-        try:
-            if not client.connection.recv(4096):
-                self._leave(client)
-                return
-        except BlockingIOError:
-            pass
+            with suppress(BlockingIOError):
+                while client.pending:
+                    sent = client.connection.send(client.pending[0])
+                    client.size -= sent
+                    if sent < len(client.pending[0]):
+                        client.pending[0] = client.pending[0][sent:]
+                    else:
+                        client.pending.popleft()
+            with suppress(BlockingIOError):
+                if not client.connection.recv(4096):
+                    raise ConnectionError
         except OSError:
             self._leave(client)
             return

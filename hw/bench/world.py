@@ -33,7 +33,7 @@ from hw.planning.scene import Scene
 from hw.runtime.rigid import looking_rotation, rigid
 from jaxcal import InputError
 from jaxcal.data.poses import rotations_from_vectors
-from jaxcal.runtime.array_types import Bool, Float
+from jaxcal.runtime.array_types import Float
 
 FULL_SCALE = 4095
 """Largest amplitude that the electronics' 12-bit converter tells, counts."""
@@ -98,10 +98,6 @@ class World(Tank):
         """What the element reports of one frame, as by :meth:`echoes`."""
         times, amplitudes = self.echoes(pose, threshold, rng, 1)
         return times[0], amplitudes[0]
-
-    def answers(self, pose: Pose, threshold: int) -> Bool[np.ndarray, " e"]:
-        """Which lines the element answers, noise apart."""
-        return self.loudness(pose) >= max(threshold, 1)
 
     def test_set(
         self, count: int = 50, seed: int = 1

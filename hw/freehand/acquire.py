@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -72,59 +72,51 @@ def acquire_free_hand(
             header = RecordingHeader("pixel", {}, 0, settings=json.dumps({_KIND: known}))
             recorder = Recorder(path, header)
         # Recordings of older versions do not tell it.
-        run = _Run(asked, guide, person, posed, recorder, kept, spacing or posed.spacing_mm)
+        run = _Run(asked, person, posed, recorder, kept, guide, spacing or posed.spacing_mm)
         return run.completed()
 
 
+@dataclass
 class _Run(Run):
     """Images are taken when the probe is held still; the guide judges them."""
 
-    ends = ("q", "enter")
+    guide: Guide
+    spacing_mm: tuple[float, float]
+    """Of the images before."""
 
-    def __init__(
-        self,
-        asked: FreeHand,
-        guide: Guide,
-        person: Person,
-        posed: PosedImages,
-        recorder: Recorder,
-        kept: KeptImages,
-        spacing_mm: tuple[float, float],
-    ) -> None:
-        super().__init__(asked, person, posed, recorder, kept)
-        self._guide, self._spacing_mm = guide, spacing_mm
+    ends = ("q", "enter")
 
     def begin(self) -> None:
         """Record the frames of the poses, and the sizes of images and pixels."""
-        source, target = self._posed.pair
-        rows, columns = self._posed.shape
+        source, target = self.posed.pair
+        rows, columns = self.posed.shape
         known = {"pose_from": source, "pose_to": target, "frame_size": [columns, rows]}
-        self._recorder.attributes("calibration", known)
-        if self._asked.spacing_mm is not None:
-            self._recorder.attributes("calibration", {"spacing_mm": list(self._asked.spacing_mm)})
+        self.recorder.attributes("calibration", known)
+        if self.asked.spacing_mm is not None:
+            self.recorder.attributes("calibration", {"spacing_mm": list(self.asked.spacing_mm)})
 
     def look(self, key: str | None) -> None:
         """Read an image, and keep it if the guide takes it."""
-        posed = self._posed.read(_SILENCE_S)
+        posed = self.posed.read(_SILENCE_S)
         frame = posed.image.array
-        look = self._guide.look(posed)
+        look = self.guide.look(posed)
         if look.taken is not None:
             self._keep(look.taken)
-        advice = self._guide.advice((frame.shape[1], frame.shape[0]))
-        self._person.show(frame, look.words, advice)
+        advice = self.guide.advice((frame.shape[1], frame.shape[0]))
+        self.person.show(frame, look.words, advice)
 
     def _keep(self, taken: Taken) -> None:
         assert taken.posed is not None
         self._check_spacing(taken.posed.image.spacing_mm)
-        self._kept.check_unit(taken.pose, self._recorder)
-        self._recorder.add_images([taken.posed.image])
-        self._recorder.add_pixel(taken.pose, taken.pixel, taken.covariance, taken.time)
-        self._kept.add(taken.pose)
+        self.kept.check_unit(taken.pose, self.recorder)
+        self.recorder.add_images([taken.posed.image])
+        self.recorder.add_pixel(taken.pose, taken.pixel, taken.covariance, taken.time)
+        self.kept.add(taken.pose)
         # The frame is on the disk; keeping all of them would fill the memory.
-        self._guide.keep(replace(taken, posed=None))
-        count = len(self._kept)
+        self.guide.keep(replace(taken, posed=None))
+        count = len(self.kept)
         at = f"{taken.pixel[0]:.1f}, {taken.pixel[1]:.1f}"
-        self._person.say(f"image {count}/{self._asked.images}: target at {at} px{self._estimate()}")
+        self.person.say(f"image {count}/{self.asked.images}: target at {at} px{self._estimate()}")
 
     def _check_spacing(self, now: tuple[float, float]) -> None:
         """Refuse an image of another depth: its pixels do not fit together with those before.
@@ -132,7 +124,7 @@ class _Run(Run):
         Raises:
             DeviceError: the sender says that they have another size.
         """
-        before = self._spacing_mm
+        before = self.spacing_mm
         if not np.allclose(now, before, rtol=_SAME_SPACING, atol=0.0):
             raise DeviceError(
                 f"an image with pixels of {now[0]:g} x {now[1]:g} mm does not fit this recording, "
@@ -143,12 +135,12 @@ class _Run(Run):
     def take_back(self) -> None:
         """Forget it in the guide, too."""
         super().take_back()
-        self._guide.taken.pop()
-        self._guide.forget()
+        self.guide.taken.pop()
+        self.guide.forget()
 
     def _estimate(self) -> str:
         """How well the images so far agree, and which one does not."""
-        taken = self._guide.taken
+        taken = self.guide.taken
         if len(taken) < _LEAST_FOR_ESTIMATE:
             return ""
         from jaxcal.calibration.calibrate import calibrate
@@ -157,9 +149,9 @@ class _Run(Run):
             np.array([each.pose for each in taken]),
             np.array([each.pixel for each in taken]),
             "pixel",
-            spacing_mm=self._asked.spacing_mm,
+            spacing_mm=self.asked.spacing_mm,
         )
-        scale = () if self._asked.spacing_mm is not None else ("scale",)
+        scale = () if self.asked.spacing_mm is not None else ("scale",)
         try:
             answer = calibrate(Recording(images), "conventional", estimate=scale)
         except CalibrationError as error:

@@ -16,14 +16,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hw.freehand.posed import PosedImage
-from hw.runtime.rigid import mean_pose
+from hw.runtime.rigid import mean_pose, turn_deg
 from jaxcal import InputError
 from jaxcal.data.segmentation.image import localise
 from jaxcal.data.segmentation.spot import Target
 from jaxcal.runtime.array_types import Float
 
 _COLUMN_NAMES, _ROW_NAMES = ("left", "middle", "right"), ("upper", "central", "lower")
-_LEAST_IN_CELL = 1
 _AT_REST = 0.25
 """While the pose is still, the target may move in the image by so much of what makes an image
 differ: 3 % of the frame by default, 2 mm of 70."""
@@ -85,12 +84,10 @@ class Look:
     Attributes:
         words: what the person is told.
         taken: the image, if it is to be taken.
-        pixel: where the target was seen, px.
     """
 
     words: str
     taken: Taken | None = None
-    pixel: tuple[float, float] | None = None
 
 
 @dataclass
@@ -168,30 +165,26 @@ class Guide:
         pixel = located.position[0]
         if middle.time <= self._stuck:
             return Look("the image stays the same while the probe moves: is the machine frozen?")
-        where = (float(pixel[0]), float(pixel[1]))
         same = self._like(pose, pixel, frame.shape)
         if same is not None:
             return Look(
                 f"as in image {same + 1}: turn the probe, or bring the target elsewhere in the "
-                "image",
-                pixel=where,
+                "image"
             )
         for index, other in enumerate(self.taken):
             if self._still(np.array([other.pose, pose])):
                 return Look(
                     f"the pose is that of image {index + 1}, but the target is elsewhere in the "
-                    "image: is the tracker frozen, or was the target moved?",
-                    pixel=where,
+                    "image: is the tracker frozen, or was the target moved?"
                 )
         if self._moves(pixel, frame.shape):
             self._contradicted = pose
         if self._contradicted is not None and self._still(np.array([self._contradicted, pose])):
             return Look(
-                "the target moves in the image while the pose is still: is the tracker frozen?",
-                pixel=where,
+                "the target moves in the image while the pose is still: is the tracker frozen?"
             )
         taken = Taken(pose, pixel, located.covariance[0], middle.time, middle)
-        return Look(f"taken: {len(self.taken) + 1}", taken, where)
+        return Look(f"taken: {len(self.taken) + 1}", taken)
 
     def _moves(self, pixel: np.ndarray, shape: tuple[int, ...]) -> bool:
         """Whether the target is elsewhere at the moment's beginning or end than in its middle."""
@@ -210,10 +203,9 @@ class Guide:
     def _like(self, pose: np.ndarray, pixel: np.ndarray, shape: tuple[int, ...]) -> int | None:
         """The image that this one does not differ from."""
         for index, other in enumerate(self.taken):
-            turn = Rotation.from_matrix(other.pose[:3, :3].T @ pose[:3, :3]).magnitude()
             moved = np.abs(pixel - other.pixel) / [shape[1], shape[0]]
             near = np.max(moved) < self.rules.different_part
-            if np.degrees(turn) < self.rules.different_deg and near:
+            if near and turn_deg(other.pose, pose) < self.rules.different_deg:
                 return index
         return None
 
@@ -243,16 +235,15 @@ class Guide:
 
     def _empty_cell(self, size: tuple[int, int]) -> str | None:
         left, top, wide, high = self.rules.region or (0, 0, *size)
-        counts = np.zeros((3, 3), int)
+        visited = np.zeros((3, 3), bool)
         for each in self.taken:
             column = int(np.clip((each.pixel[0] - left) / wide * 3, 0, 2))
             row = int(np.clip((each.pixel[1] - top) / high * 3, 0, 2))
-            counts[row, column] += 1
-        empty = np.argwhere(counts < _LEAST_IN_CELL)
-        if not len(empty):
+            visited[row, column] = True
+        if visited.all():
             return None
         # The empty cell farthest from the cells where the target has been.
-        seen = np.argwhere(counts >= _LEAST_IN_CELL)
+        empty, seen = np.argwhere(~visited), np.argwhere(visited)
         away = np.linalg.norm(empty[:, None] - seen[None], axis=2).min(axis=1)
         row, column = empty[int(np.argmax(away))]
         return f"{_ROW_NAMES[row]} {_COLUMN_NAMES[column]}"

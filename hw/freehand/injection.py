@@ -33,21 +33,20 @@ from hw.midplane.bracket import Bracket
 from hw.midplane.live_view import describe, profile
 from hw.midplane.pattern_injection import View, bar, bar_length, sides_seen
 from hw.midplane.search import Echoes, PlacementError
-from hw.recording.check import electronics_of, probe_of
+from hw.recording.check import devices_of
 from hw.recording.layout import RecordingHeader
 from hw.recording.recorder import Recorder
 from hw.recording.resuming import (
     check_same,
     compare_electronics,
     described_electronics,
-    described_probe,
 )
 from hw.recording.session import DELAY_S, Watch, median_times
 from hw.runtime.errors import DeviceError, StaleError
-from hw.runtime.rigid import mean_pose
+from hw.runtime.rigid import mean_pose, turn_deg
 from hw.setup.description import HandHeldSetup
 from hw.ultrasound.receiver import UltrasoundStream
-from jaxcal.data.poses import inverse_poses
+from jaxcal.data.poses import targets_in_images
 from jaxcal.data.recording import MetresError, check_pose_units
 from jaxcal.io.given_files import naming
 from jaxcal.runtime.array_types import Float
@@ -76,16 +75,16 @@ class Sample:
     """One frame of the element and where the probe was.
 
     Attributes:
-        t: arrival, s.
+        frame: as it came.
+        pose: of the probe, mm.
         offset_mm: the probe's offset along the elevational axis at the target.
         peak: amplitude, counts; 0 where the element was not heard.
-        translation: (3,) of the pose, mm.
     """
 
-    t: float
+    frame: EchoFrame
+    pose: Float[np.ndarray, "4 4"]
     offset_mm: float
     peak: float
-    translation: Float[np.ndarray, " 3"]
 
 
 def acquire_by_injection(
@@ -118,10 +117,10 @@ def acquire_by_injection(
     kept, probe, before = KeptImages(), setup.probe, {}
     if resume:
         asked, told = recorded_request(path, _KIND, asked)
+        known, before = devices_of(path)
         with naming(path):
-            check_same("probe", probe_of(path), described_probe(probe))
+            check_same("probe", known, asdict(probe))
             check_same("scene", told.get("scene"), _scene(setup))
-        before = electronics_of(path)
         kept = KeptImages(read_images(path))
     with contextlib.ExitStack() as stack:
         stream = stack.enter_context(UltrasoundStream(asked.host, asked.port, device=asked.device))
@@ -134,7 +133,7 @@ def acquire_by_injection(
         unit = described_electronics(echo)
         changes = compare_electronics(before, unit)
         recorder = Recorder(path) if resume else _recorder(path, asked, setup, posed)
-        run = _Run(asked, setup, person, posed, echo, unit, changes, recorder, kept)
+        run = _Run(asked, person, posed, recorder, kept, setup, echo, unit, changes)
         return run.completed()
 
 
@@ -152,7 +151,7 @@ def _recorder(
     known = {**asked.settings(posed.pair), "scene": _scene(setup), "search": asdict(setup.search)}
     header = RecordingHeader(
         kind="time_of_flight",
-        probe={"kind": probe.kind, **described_probe(probe)},
+        probe={"kind": probe.kind, **asdict(probe)},
         lines=probe.elements,
         settings=json.dumps({_KIND: known}),
     )
@@ -165,27 +164,21 @@ def _switch_off(echo: ActiveEcho) -> None:
         echo.inject(False)
 
 
+@dataclass
 class _Run(Run):
     """Images are taken when the person accepts a place in the middle of a sweep."""
 
-    def __init__(
-        self,
-        asked: FreeHand,
-        setup: HandHeldSetup,
-        person: Person,
-        posed: PosedImages,
-        echo: ActiveEcho,
-        unit: dict[str, float | str],
-        changes: list[str],
-        recorder: Recorder,
-        kept: KeptImages,
-    ) -> None:
-        super().__init__(asked, person, posed, recorder, kept)
-        self.options = ("--placement", _KIND, "--setup", setup.source)
-        self._setup, self._echo, self._unit, self._changes = setup, echo, unit, changes
+    setup: HandHeldSetup
+    echo: ActiveEcho
+    unit: dict[str, float | str]
+    """What the recording keeps of the electronics."""
+    changes: list[str]
+    """Lines about what has changed since the recording was begun."""
+
+    def __post_init__(self) -> None:
+        self.options = ("--placement", _KIND, "--setup", self.setup.source)
         self._images: deque[PosedImage] = deque(maxlen=_RECENT)
         self._waiting: list[EchoFrame] = []
-        self._held: deque[tuple[float, np.ndarray, EchoFrame]] = deque()
         self._pattern: tuple[int, int] | None = None
         self._patterned = 0.0
         self._heard, self._shown = time.monotonic(), 0.0
@@ -195,8 +188,8 @@ class _Run(Run):
 
     def begin(self) -> None:
         """Record the electronics, and what has changed since the recording was begun."""
-        self._recorder.attributes("ae", self._unit)
-        for change in self._changes:
+        self.recorder.attributes("ae", self.unit)
+        for change in self.changes:
             self.note("changed", change)
 
     def look(self, key: str | None) -> None:
@@ -214,26 +207,26 @@ class _Run(Run):
         """Begin a new sweep; places count from where the element is heard first."""
         self._samples: deque[Sample] = deque()
         self._origin: tuple[np.ndarray, np.ndarray] | None = None
-        self._held.clear()
+        """Pose where the element was heard first, and the target in the tracker's frame, mm."""
         self._message, self._hurried = "", False
 
     def _listen(self) -> None:
         # Read all images that wait: the bar must show where the probe is now, however busy the PC.
-        self._images.append(self._posed.read(_SILENCE_S))
-        for _ in range(self._posed.behind - 1):
-            self._images.append(self._posed.read(_SILENCE_S))
-        frames = self._echo.drain()
+        self._images.append(self.posed.read(_SILENCE_S))
+        for _ in range(self.posed.behind - 1):
+            self._images.append(self.posed.read(_SILENCE_S))
+        frames = self.echo.drain()
         now = time.monotonic()
         if frames:
             self._heard = now
         elif now - self._heard > _SILENCE_S:
             raise StaleError(f"no frame for {_SILENCE_S:g} s: {SILENT}", device="active echo")
-        self._recorder.add_echo(frames)
+        self.recorder.add_echo(frames)
         if frames:
             self._late_s = frames[-1].late_s
         if now - self._delay_measured > DELAY_S:
             self._delay_measured = now
-            self._echo.measure_delay()
+            self.echo.measure_delay()
         self._waiting += [frame for frame in frames if not frame.late_s > _LATEST_S]
         later = []
         for frame in self._waiting:
@@ -260,26 +253,20 @@ class _Run(Run):
         amplitude = np.where(answered, frame.amplitude, 0.0)
         echoes = Echoes(amplitude[None].astype(float), answered[None])
         self._loudest_line = echoes.loudest_line
-        if self._origin is not None:
-            turn = spread_of(np.stack([self._origin[0], pose]))[1]
-            if turn > _ANOTHER_DEG:
-                self._new_sweep()
+        if self._origin is not None and turn_deg(self._origin[0], pose) > _ANOTHER_DEG:
+            self._new_sweep()
         if self._origin is None and echoes.heard:
-            self._origin = pose, self._target_of(frame, echoes.loudest_line)
+            seen = self._target_of(frame, echoes.loudest_line)
+            self._origin = pose, (pose @ self.setup.image_to_probe @ seen)[:3]
         if self._origin is None:
             return
-        offset = self._offset(pose)
-        self._samples.append(Sample(frame.t_host, offset, echoes.peak, pose[:3, 3]))
-        while self._samples[-1].t - self._samples[0].t > _KEPT_S:
+        self._samples.append(Sample(frame, pose, self._offset(pose), echoes.peak))
+        while frame.t_host - self._samples[0].frame.t_host > _KEPT_S:
             self._samples.popleft()
-        self._held.append((frame.t_host, pose, frame))
-        hold = self._asked.rules.hold_s
-        while self._held[-1][0] - self._held[0][0] > hold:
-            self._held.popleft()
 
     def _target_of(self, frame: EchoFrame, line: int) -> Float[np.ndarray, " 4"]:
         """The target in the image frame, roughly: below the loudest line, at the shortest range."""
-        probe = self._setup.probe
+        probe = self.setup.probe
         lateral = probe.element_positions()[line, 0]
         distance = float(np.nanmin(probe.one_way_range_mm(frame.tof_s)))
         return np.array([lateral, 0.0, distance, 1.0])
@@ -287,10 +274,7 @@ class _Run(Run):
     def _offset(self, pose: Float[np.ndarray, "4 4"]) -> float:
         """The probe's offset along the elevational axis at the target, mm."""
         assert self._origin is not None
-        origin, target = self._origin
-        x = self._setup.image_to_probe
-        there = inverse_poses((pose @ x)[None])[0] @ origin @ x @ target
-        return -float(there[1])
+        return -float(targets_in_images(pose, self.setup.image_to_probe, self._origin[1])[1])
 
     def _inject(self, now: float) -> None:
         """Draw the bar again if it has changed, but not more often than the eye can follow."""
@@ -300,8 +284,8 @@ class _Run(Run):
         if self._pattern == (length, self._loudest_line):
             return
         self._pattern, self._patterned = (length, self._loudest_line), now
-        self._echo.load_pattern(bar(length, self._loudest_line, self._setup.probe.elements))
-        self._echo.inject(True, _DELAY_TICKS)
+        self.echo.load_pattern(bar(length, self._loudest_line, self.setup.probe.elements))
+        self.echo.inject(True, _DELAY_TICKS)
 
     @property
     def _loudest(self) -> float:
@@ -313,10 +297,7 @@ class _Run(Run):
         if not self._samples:
             return None
         loudest = self._loudest
-        seen = tuple((s.offset_mm, bar_length(s.peak, loudest)) for s in self._samples)
-        last = self._samples[-1]
-        longest = max(length for _, length in seen)
-        return View(seen[-1][1], longest, last.offset_mm, 0.0, last.peak, seen)
+        return View(tuple((s.offset_mm, bar_length(s.peak, loudest)) for s in self._samples))
 
     def _show(self) -> None:
         now = time.monotonic()
@@ -324,7 +305,7 @@ class _Run(Run):
             return
         self._shown = now
         frame = self._images[-1].image.array
-        title = f"image {len(self._kept) + 1} of {self._asked.images}"
+        title = f"image {len(self.kept) + 1} of {self.asked.images}"
         view = self._view()
         late = ""
         late_s = self._images[-1].image.late_s
@@ -335,9 +316,9 @@ class _Run(Run):
         if view is None:
             reason = self._images[-1].why or "the element is not heard"
             words = f"{title}: {late or f'{reason}: bring the probe over it'}"
-            self._person.show(frame, words, "nothing heard yet")
+            self.person.show(frame, words, "nothing heard yet")
             return
-        rows = [f"{title}: {describe(view, 0.0).rpartition(',')[0]}", *profile(view)]
+        rows = [f"{title}: {describe(view)}", *profile(view)]
         if late:
             rows.append(late)
         elif self._hurried:
@@ -346,14 +327,14 @@ class _Run(Run):
             rows.append("the poses look like metres: let the server send them in mm")
         elif self._message:
             rows.append(self._message)
-        self._person.show(frame, "\n".join(rows), hand_advice(view, self._peak()))
+        self.person.show(frame, "\n".join(rows), hand_advice(view, self._peak()))
 
     def _in_metres(self, view: View) -> bool:
         """Whether the bar shrinks while the probe, by its poses, stays where it is."""
         if min(length for _, length in view.seen) > view.longest // 2:
             return False
         try:
-            check_pose_units(np.array([sample.translation for sample in self._samples]))
+            check_pose_units(np.array([sample.pose[:3, 3] for sample in self._samples]))
         except MetresError:
             return True
         return False
@@ -365,28 +346,30 @@ class _Run(Run):
             return "the element is not heard here"
         if not all(sides_seen(view.seen)):
             return "visit both sides first: the bar must shrink on each"
-        held, rules = list(self._held), self._asked.rules
-        if not held or held[-1][0] - held[0][0] < 0.8 * rules.hold_s:
+        rules, last_s = self.asked.rules, self._samples[-1].frame.t_host
+        held = [s for s in self._samples if last_s - s.frame.t_host <= rules.hold_s]
+        if last_s - held[0].frame.t_host < 0.8 * rules.hold_s:
             return f"hold still for {rules.hold_s:g} s, then accept"
-        poses = np.array([pose for _, pose, _ in held])
-        shift, turn = spread_of(poses)
+        shift, turn = spread_of(np.array([sample.pose for sample in held]))
         if shift > rules.still_mm or turn > rules.still_deg:
             return f"the probe moved ({shift:.1f} mm, {turn:.1f} degrees): hold still, then accept"
         try:
-            bracket, where = self._bracket([frame.t_host for *_, frame in held])
+            peak = fit_peak(*self._sweep(), self.setup.search.full_scale)
         except PlacementError as error:
             return str(error.args[0])
+        where = float(np.mean([sample.offset_mm for sample in held]))
+        bracket = peak.bracket(where, self.setup.search)
         if abs(bracket.centre_mm) > _BESIDE_MM:
             way = "up" if bracket.centre_mm > 0 else "down"
             return f"the bar is longest {abs(bracket.centre_mm):.1f} mm further {way}"
-        self._keep(poses, [frame for *_, frame in held], bracket, where)
+        self._keep(held, bracket, where)
         return ""
 
     def _peak(self) -> float:
         """Where the bar is longest, mm: the fitted maximum, or the loudest place without one."""
         offsets, peaks = self._sweep()
         try:
-            return fit_peak(offsets, peaks, self._setup.search.full_scale).place_mm
+            return fit_peak(offsets, peaks, self.setup.search.full_scale).place_mm
         except PlacementError:
             return float(offsets[int(np.argmax(peaks))])
 
@@ -394,36 +377,24 @@ class _Run(Run):
         offsets = np.array([sample.offset_mm for sample in self._samples])
         return offsets, np.array([sample.peak for sample in self._samples])
 
-    def _bracket(self, times: list[float]) -> tuple[Bracket, float]:
-        """The bracket of the target's offset while the probe was held, and the probe's place."""
-        settings = self._setup.search
-        offsets, peaks = self._sweep()
-        peak = fit_peak(offsets, peaks, settings.full_scale)
-        now = np.isin([sample.t for sample in self._samples], times)
-        where = float(offsets[now].mean())
-        return peak.bracket(where, settings), where
-
-    def _keep(
-        self, poses: np.ndarray, frames: list[EchoFrame], bracket: Bracket, where: float
-    ) -> None:
-        times, amplitude = median_times(frames)
-        pose = mean_pose(poses)
-        self._kept.check_unit(pose, self._recorder)
-        self._recorder.add_images([self._images[-1].image])
-        self._recorder.add_selected(
+    def _keep(self, held: list[Sample], bracket: Bracket, where: float) -> None:
+        times, amplitude = median_times([sample.frame for sample in held])
+        pose = mean_pose(np.array([sample.pose for sample in held]))
+        self.kept.check_unit(pose, self.recorder)
+        self.recorder.add_images([self._images[-1].image])
+        self.recorder.add_selected(
             pose,
             times,
             kind="time_of_flight",
-            max_elevation=bracket.max_elevation_mm,
             amplitude=amplitude,
-            t_host=frames[-1].t_host,
-            target=self._kept.next_row,
-            bracket=(bracket.centre_mm, bracket.low_mm, bracket.high_mm, bracket.sd_mm),
+            t_host=held[-1].frame.t_host,
+            target=self.kept.next_row,
+            bracket=bracket,
             offset=where,
         )
-        self._kept.add(pose)
-        self._person.say(
-            f"image {len(self._kept)}/{self._asked.images}: offset {bracket.centre_mm:+.2f} in "
+        self.kept.add(pose)
+        self.person.say(
+            f"image {len(self.kept)}/{self.asked.images}: offset {bracket.centre_mm:+.2f} in "
             f"[{bracket.low_mm:+.2f}, {bracket.high_mm:+.2f}] mm"
         )
         self._new_sweep()

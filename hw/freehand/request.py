@@ -17,7 +17,6 @@ from jaxcal.cli.common import ExitCode
 from jaxcal.data.recording import MINIMUM_IMAGES, check_spacing_unit
 from jaxcal.io.frame_names import FramePair
 from jaxcal.io.openigtlink import PORT
-from jaxcal.runtime.messages import command_line
 
 _ENOUGH = 30
 """Default number of images to take."""
@@ -129,28 +128,12 @@ class FreeHandStopped(CalibrationError):
     """A run that ended early; one line with what happened and what to do next.
 
     Args:
-        reason: what happened.
-        count: images that count.
-        asked: what was asked for.
-        kept: path of the recording.
-        options: with which it goes on.
+        message: the line.
         interrupted: by the person.
     """
 
-    def __init__(
-        self,
-        reason: str,
-        count: int,
-        asked: FreeHand,
-        kept: str,
-        *options: str,
-        interrupted: bool = False,
-    ) -> None:
-        command = ["jaxcal-hw", "free-hand", f"{asked.host}:{asked.port}", kept, *options]
-        super().__init__(
-            f"{reason}; {count} of {asked.images} images are in {kept}; go on with: "
-            f"{command_line([*command, '--resume'])}"
-        )
+    def __init__(self, message: str, *, interrupted: bool) -> None:
+        super().__init__(message)
         self.exit_code = ExitCode.INTERRUPTED if interrupted else ExitCode.STOPPED
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
@@ -20,6 +21,7 @@ from jaxcal import CalibrationError, InputError
 from jaxcal.data.recording import MINIMUM_IMAGES, MetresError, check_pose_units
 from jaxcal.io.untrusted import UpTo
 from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.messages import command_line
 
 _IMAGES = UpTo(100_000, "images")
 
@@ -70,24 +72,20 @@ class KeptImages:
         self._poses.pop()
 
 
+@dataclass
 class Run(ABC):
     """One run over open devices and an open recording."""
 
-    ends: ClassVar[tuple[str, ...]] = ("q",)
-    """Keys that end the run."""
-    options: tuple[str, ...] = ()
+    asked: FreeHand
+    person: Person
+    posed: PosedImages
+    recorder: Recorder
+    kept: KeptImages
+    options: tuple[str, ...] = field(default=(), init=False)
     """With which the run goes on, on the command line."""
 
-    def __init__(
-        self,
-        asked: FreeHand,
-        person: Person,
-        posed: PosedImages,
-        recorder: Recorder,
-        kept: KeptImages,
-    ) -> None:
-        self._asked, self._person, self._posed = asked, person, posed
-        self._recorder, self._kept = recorder, kept
+    ends: ClassVar[tuple[str, ...]] = ("q",)
+    """Keys that end the run."""
 
     def completed(self) -> int:
         """Run until enough images are taken, or the person ends it; their number.
@@ -96,33 +94,34 @@ class Run(ABC):
             FreeHandStopped: interrupted, a device was lost, or too few images.
         """
         try:
-            with self._recorder:
+            with self.recorder:
                 return self._go()
         except KeyboardInterrupt:
             reason, interrupted = "interrupted", True
         except (DeviceError, CalibrationError) as error:
             reason, interrupted = str(error), False
-        count, kept = len(self._kept), self._recorder.kept
-        raise FreeHandStopped(
-            reason, count, self._asked, kept, *self.options, interrupted=interrupted
-        )
+        asked, path = self.asked, self.recorder.kept
+        server = f"{asked.host}:{asked.port}"
+        again = command_line(["jaxcal-hw", "free-hand", server, path, *self.options, "--resume"])
+        state = f"{reason}; {len(self.kept)} of {asked.images} images are in {path}"
+        raise FreeHandStopped(f"{state}; go on with: {again}", interrupted=interrupted)
 
     def _go(self) -> int:
         self.begin()
-        self.note("started", f"{self._asked.images - len(self._kept)} images to take")
-        while len(self._kept) < self._asked.images:
-            key = self._person.key()
+        self.note("started", f"{self.asked.images - len(self.kept)} images to take")
+        while len(self.kept) < self.asked.images:
+            key = self.person.key()
             if key in self.ends:
                 break
-            if key == "u" and self._kept:
+            if key == "u" and self.kept:
                 self.take_back()
-                self.note("taken back", f"the last image; {len(self._kept)} are left")
+                self.note("taken back", f"the last image; {len(self.kept)} are left")
             self.look(key)
-        count = len(self._kept)
+        count = len(self.kept)
         if count < MINIMUM_IMAGES:
             raise InputError(f"{count} images are too few: {MINIMUM_IMAGES} are needed")
         self.note("finished", f"{count} images")
-        self._recorder.finish()
+        self.recorder.finish()
         return count
 
     @abstractmethod
@@ -135,12 +134,12 @@ class Run(ABC):
 
     def take_back(self) -> None:
         """Mask the last image that counts; there is one."""
-        self._kept.take_back(self._recorder)
+        self.kept.take_back(self.recorder)
 
     def note(self, kind: str, text: str) -> None:
         """Say a line, and put it among the recording's events."""
-        self._recorder.add_event(kind, text, REAL.now())
-        self._person.say(f"{kind}: {text}")
+        self.recorder.add_event(kind, text, REAL.now())
+        self.person.say(f"{kind}: {text}")
 
 
 def read_images(

@@ -26,7 +26,7 @@ class TerminalPerson:
         keys: what the keys do, in words.
     """
 
-    def __init__(self, screen: Screen, keyboard: Keyboard | None, keys: str = KEYS) -> None:
+    def __init__(self, screen: Screen, keyboard: Keyboard, keys: str = KEYS) -> None:
         self._screen, self._keyboard, self._keys = screen, keyboard, keys
         self._shown = 0.0
 
@@ -45,6 +45,4 @@ class TerminalPerson:
 
     def key(self) -> str | None:
         """The next key; None where there was none, or no terminal."""
-        if self._keyboard is None or not self._keyboard.there:
-            return None
         return self._keyboard.read(0.0)

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hw.midplane.bracket import Bracket, Placement, widened
-from hw.midplane.search import PlacementError, Settings, Walker, coarse, procedure
+from hw.midplane.bracket import Bracket, Placement
+from hw.midplane.search import Bench, PlacementError, Settings, Walker, Watch, coarse
 from jaxcal.runtime.array_types import Float
 
 LEAST_FRACTION = 0.4
@@ -31,21 +31,17 @@ class Peak:
         sd_mm: its standard deviation.
         amplitude: fitted, counts.
         width_mm: SD of the Gaussian across the beam.
-        used: samples in the fit.
     """
 
     place_mm: float
     sd_mm: float
     amplitude: float
     width_mm: float
-    used: int
 
     def bracket(self, where_mm: float, settings: Settings) -> Bracket:
         """Where the target's offset lies in an image that was taken at ``where_mm``."""
-        centre, half = self.place_mm - where_mm, settings.factor * self.sd_mm
-        return widened(
-            centre, centre - half, centre + half, self.sd_mm, settings.hidden_sd_mm, settings.factor
-        )
+        half = settings.factor * self.sd_mm
+        return settings.bracket(self.place_mm - where_mm, half, self.sd_mm)
 
 
 def fit_peak(
@@ -92,7 +88,6 @@ def fit_peak(
         sd_mm=float(np.sqrt(gradient @ covariance @ gradient)),
         amplitude=float(np.exp(top - slope**2 / (4 * curvature))),
         width_mm=float(np.sqrt(-0.5 / curvature)),
-        used=len(x),
     )
 
 
@@ -116,7 +111,7 @@ def scan_up(walker: Walker, start_mm: float, step_mm: float) -> Peak:
     offset = middle - 1.4 * width
     where, echoes = walker.stop_at(offset)
     # The coarse steps may be wrong: go down until the scan begins on the lower skirt.
-    loudest = max(echoes.peak, max(amplitude for _, amplitude, _ in walker.samples))
+    loudest = max(amplitude for _, amplitude, _ in walker.samples)
     while echoes.peak > LEAST_FRACTION * loudest:
         offset -= width
         where, echoes = walker.stop_at(offset)
@@ -141,19 +136,15 @@ def scan_up(walker: Walker, start_mm: float, step_mm: float) -> Peak:
 
 def _overview(walker: Walker, start_mm: float) -> tuple[float, float]:
     """Middle and SD (mm) of the beam, roughly, from half coarse steps up until it fades."""
-    settings = walker.settings
-    places: list[float] = []
-    loud: list[float] = []
-    offset = start_mm
+    settings, first = walker.settings, len(walker.samples)
+    loudest, offset = 0.0, start_mm
     while True:
-        where, echoes = walker.stop_at(offset)
-        places.append(where)
-        loud.append(echoes.peak)
-        faded = echoes.peak < LEAST_FRACTION * max(loud)
-        if (faded and max(loud) > 0) or offset > start_mm + settings.span_mm:
+        _, echoes = walker.stop_at(offset)
+        loudest = max(loudest, echoes.peak)
+        if echoes.peak < LEAST_FRACTION * loudest or offset > start_mm + settings.span_mm:
             break
         offset += 0.5 * settings.coarse_mm
-    x, level = np.array(places), np.array(loud)
+    x, level, _ = np.array(walker.samples[first:]).T
     best = int(np.argmax(level))
     if level[best] == 0:
         walker.recover()
@@ -168,43 +159,44 @@ def _overview(walker: Walker, start_mm: float) -> tuple[float, float]:
     return float(x[best]), 0.5 * settings.coarse_mm
 
 
-def go_to_peak(walker: Walker, peak: Peak) -> tuple[float, float]:
+def go_to_peak(walker: Walker, peak: Peak) -> None:
     """Go to a fitted maximum from below, and check by the amplitude that it is there.
-
-    Returns:
-        Where the probe stands (mm, tracked) and the amplitude there.
 
     Raises:
         PlacementError: the amplitude says that the maximum is elsewhere: the motion has hysteresis,
             or the target moved.
     """
-    where, echoes = walker.stop_at(peak.place_mm)
+    _, echoes = walker.stop_at(peak.place_mm)
     if not echoes.heard:
         walker.recover()
-        where, echoes = walker.stop_at(peak.place_mm)
-    amplitude = echoes.peak
+        _, echoes = walker.stop_at(peak.place_mm)
     if not echoes.saturated(walker.settings.full_scale):
-        ratio = max(peak.amplitude / max(amplitude, 1e-9), 1.0)
+        ratio = max(peak.amplitude / max(echoes.peak, 1e-9), 1.0)
         off = peak.width_mm * float(np.sqrt(2 * np.log(ratio)))
         if off > walker.settings.hysteresis_mm:
             raise PlacementError(
                 f"back at the maximum the amplitude is that of {off:.2f} mm beside it: the motion "
                 "has hysteresis, or the target moved"
             )
-    return where, amplitude
 
 
-@procedure
-def amplitude_scan(walker: Walker, start_mm: float) -> Placement:
-    """Scan with the robot, fit the maximum, go there."""
-    settings = walker.settings
-    peak = scan_up(walker, coarse(walker, start_mm), settings.fine_mm)
-    try:
-        where, amplitude = go_to_peak(walker, peak)
-    except PlacementError:
-        walker.notes.append("the maximum was not found again; scanned once more")
-        peak = scan_up(walker, peak.place_mm - settings.coarse_mm, settings.fine_mm)
-        where, amplitude = go_to_peak(walker, peak)
-    half = settings.factor * peak.sd_mm
-    edges = (peak.place_mm - half, peak.place_mm + half)
-    return walker.placement("amplitude-scan", where, edges, peak.sd_mm, amplitude)
+def amplitude_scan(
+    bench: Bench,
+    settings: Settings | None = None,
+    start_mm: float = 0.0,
+    watch: Watch | None = None,
+) -> Placement:
+    """Scan with the robot, fit the maximum, go there.
+
+    Arguments as of :func:`hw.midplane.search.first_seen`.
+    """
+    with Walker(bench, settings, watch) as walker:
+        settings = walker.settings
+        peak = scan_up(walker, coarse(walker, start_mm), settings.fine_mm)
+        try:
+            go_to_peak(walker, peak)
+        except PlacementError:
+            walker.notes.append("the maximum was not found again; scanned once more")
+            peak = scan_up(walker, peak.place_mm - settings.coarse_mm, settings.fine_mm)
+            go_to_peak(walker, peak)
+        return walker.placement(peak.place_mm, settings.factor * peak.sd_mm, peak.sd_mm)

@@ -56,57 +56,21 @@ class Bracket:
         return bool(self.low_mm <= other.high_mm and other.low_mm <= self.high_mm)
 
 
-def widened(
-    centre_mm: float, low_mm: float, high_mm: float, sd_mm: float, other_sd_mm: float, factor: float
-) -> Bracket:
-    """A bracket from the edges that a search found and independent errors that it cannot see.
-
-    Args:
-        centre_mm: best guess of the offset.
-        low_mm: lower edge as seen.
-        high_mm: upper edge as seen.
-        sd_mm: SD of the guess itself.
-        other_sd_mm: SD of what the search cannot see (the response's own shift, the last move).
-        factor: half width of the bracket in SDs.
-
-    Returns:
-        Its ends: their distance from the centre is the root of the summed squares of the seen
-        distance and of ``factor`` times ``other_sd_mm``.
-    """
-    hidden = factor * other_sd_mm
-    return Bracket(
-        centre_mm=centre_mm,
-        low_mm=centre_mm - float(np.hypot(centre_mm - low_mm, hidden)),
-        high_mm=centre_mm + float(np.hypot(high_mm - centre_mm, hidden)),
-        sd_mm=float(np.hypot(sd_mm, other_sd_mm)),
-    )
-
-
 @dataclass(frozen=True)
 class Placement:
     """One finished placement; the probe stands at ``offset_mm``.
 
     Attributes:
-        procedure: ``amplitude-scan``, ``pattern-injection``, ``threshold-climb``, ``image-scan`` or
-            ``first-seen``.
         bracket: where the target's offset lies.
         offset_mm: how far the probe was moved along its elevational axis from the plan's pose.
-        amplitude: of the response where it stands, counts.
-        threshold: response threshold in force at the end.
         moves: single moves made.
-        travel_mm: elevational way travelled.
-        frames: active-echo frames listened to.
-        samples: (k, 3) offset (mm), amplitude (counts; 0: not heard) and threshold of every stop.
+        samples: (k, 3) offset (mm), amplitude (counts; 0: not heard) and threshold of every stop,
+            the one where it stands last.
         notes: what a person should know.
     """
 
-    procedure: str
     bracket: Bracket
     offset_mm: float
-    amplitude: float
-    threshold: int
     moves: int
-    travel_mm: float
-    frames: int
     samples: Float[np.ndarray, "k 3"]
     notes: tuple[str, ...] = ()

@@ -132,8 +132,7 @@ def image_scan(
         coarse_mm=min(settings.coarse_mm, COARSE_MM),
         fine_mm=min(settings.fine_mm, FINE_MM),
     )
-    placement = amplitude_scan(bench, settings, start_mm, watch)
-    return replace(placement, procedure="image-scan")
+    return amplitude_scan(bench, settings, start_mm, watch)
 
 
 def pixel_of(

@@ -26,6 +26,8 @@ from jaxcal import InputError
 _LEAST_STEP_MM, _LARGEST_STEP_MM = 0.02, 1.0
 _REFRESH_S = 0.25
 _NEAR_MM = 0.3
+_STEPS = {"up": 1, "k": 1, "pageup": 4, "K": 4, "down": -1, "j": -1, "pagedown": -4, "J": -4}
+"""Steps that a key asks for."""
 _PROFILE = " ▁▂▃▄▅▆▇█"
 _PROFILE_COLUMNS = 60
 _OTHER_ROWS = 9
@@ -52,18 +54,8 @@ class Keys:
     def decide(self, key: str, view: View) -> Decision | None:
         """What a key asks for; None if it decides nothing (an unknown key, a new step size)."""
         step = self.step(view)
-        way = {
-            "up": 1,
-            "k": 1,
-            "pageup": 4,
-            "K": 4,
-            "down": -1,
-            "j": -1,
-            "pagedown": -4,
-            "J": -4,
-        }.get(key)
-        if way is not None:
-            return Decision("go", view.offset_mm + way * step)
+        if key in _STEPS:
+            return Decision("go", view.offset_mm + _STEPS[key] * step)
         if key in ("+", "-"):
             step = step * 2 if key == "+" else step / 2
             self.step_mm = min(max(step, _LEAST_STEP_MM), _LARGEST_STEP_MM)
@@ -76,12 +68,13 @@ class Keys:
         return None
 
 
-def describe(view: View, step_mm: float) -> str:
-    """The view as one line of text."""
+def describe(view: View, step_mm: float = 0.0) -> str:
+    """The view as one line of text, with the step of the next move (mm) where there is one."""
     bar = "#" * view.length
+    step = f", step {step_mm:.2f} mm" if step_mm else ""
     return (
         f"{view.offset_mm:+7.2f} mm |{bar:<{LONGEST}}| {view.length:2d} of {view.longest:2d} "
-        f"seen, step {step_mm:.2f} mm"
+        f"seen{step}"
     )
 
 
@@ -104,21 +97,12 @@ def profile(view: View) -> tuple[str, str]:
     """The longest bar seen in each stretch of offsets, drawn as columns, and a pointer below it."""
     places = np.array([place for place, _ in view.seen])
     low, high = min(places.min(), -2.0), max(places.max(), 2.0)
-    at = np.clip(
-        ((places - low) / (high - low) * (_PROFILE_COLUMNS - 1)).round().astype(int), 0, None
-    )
+    at = ((places - low) / (high - low) * (_PROFILE_COLUMNS - 1)).round().astype(int)
     heights = np.zeros(_PROFILE_COLUMNS, int)
     np.maximum.at(heights, at, np.array([length for _, length in view.seen]))
     steps = np.ceil(heights / LONGEST * (len(_PROFILE) - 1)).astype(int)
     drawn = "".join(_PROFILE[step] for step in steps)
-    here = int(
-        np.clip(
-            round((view.offset_mm - low) / (high - low) * (_PROFILE_COLUMNS - 1)),
-            0,
-            _PROFILE_COLUMNS,
-        )
-    )
-    return f"{low:+6.1f} {drawn} {high:+.1f} mm", f"{'':7}{'':{here}}^"
+    return f"{low:+6.1f} {drawn} {high:+.1f} mm", f"{'':7}{'':{at[-1]}}^"
 
 
 class TerminalOperator:

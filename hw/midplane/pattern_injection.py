@@ -20,7 +20,7 @@ from typing import Literal, Protocol, runtime_checkable
 import numpy as np
 
 from hw.midplane.bracket import Placement
-from hw.midplane.search import Bench, PlacementError, Settings, Walker, Watch, coarse, procedure
+from hw.midplane.search import Bench, PlacementError, Settings, Walker, Watch, coarse
 from hw.runtime.errors import DeviceError
 from jaxcal import InputError
 from jaxcal.runtime.array_types import UInt8
@@ -97,27 +97,34 @@ class View:
     """What the operator sees.
 
     Attributes:
-        length: of the bar, lines.
-        longest: the longest bar seen so far.
-        offset_mm: where the probe is.
-        step_mm: of the next move.
-        amplitude: counts.
-        seen: (offset, length) of every look so far, this one last.
+        seen: (offset in mm, length of the bar in lines) of every look so far, this one last.
+        step_mm: of the next move; 0 where a hand moves the probe.
         frame: gives the newest B-mode frame, or None where there is none; raises the error of a
             device that is lost while the operator looks.
         message: what the procedure has to say.
         title: which pose this is.
     """
 
-    length: int
-    longest: int
-    offset_mm: float
-    step_mm: float
-    amplitude: float
     seen: tuple[tuple[float, int], ...]
+    step_mm: float = 0.0
     frame: Callable[[], Frame | None] = _no_frame
     message: str = ""
     title: str = ""
+
+    @property
+    def offset_mm(self) -> float:
+        """Where the probe is."""
+        return self.seen[-1][0]
+
+    @property
+    def length(self) -> int:
+        """Of the bar, lines."""
+        return self.seen[-1][1]
+
+    @property
+    def longest(self) -> int:
+        """Length of the longest bar seen so far, lines."""
+        return max(length for _, length in self.seen)
 
 
 @dataclass(frozen=True)
@@ -248,53 +255,10 @@ def pattern_injection(
         SkippedError: by the operator.
         PlacementError: given up by a guard; the probe is at the last good place.
     """
-
-    def search(walker: Walker, start_mm: float) -> Placement:
-        settings = walker.settings
-        coarse(walker, start_mm)
-        loudest, message = 0.0, ""
-        heard: list[tuple[float, float]] = []
-        where, echoes = walker.where, walker.listen()
-        for _ in range(_MOST_LOOKS):
-            if echoes.saturated(settings.full_scale):
-                raise PlacementError("the amplitude saturates: turn the gain down")
-            loudest = max(loudest, echoes.peak)
-            heard.append((where, echoes.peak))
-            seen = [(at, bar_length(amplitude, loudest)) for at, amplitude in heard]
-            lines = echoes.amplitude.shape[1]
-            injector.load_pattern(bar(seen[-1][1], echoes.loudest_line, lines))
-            injector.inject(True, _DELAY_TICKS)
-            decision = operator(
-                View(
-                    seen[-1][1],
-                    max(length for _, length in seen),
-                    where,
-                    settings.fine_mm,
-                    echoes.peak,
-                    tuple(seen),
-                    frame,
-                    message,
-                    title,
-                )
-            )
-            message = ""
-            if decision.what == "give-up":
-                raise SkippedError("the operator gave up the pose")
-            if decision.what == "accept":
-                low, high = flanks(seen, where)
-                enough = all(sides_seen(seen)) and echoes.heard
-                if enough and low is not None and high is not None:
-                    edges = (0.5 * sum(low), 0.5 * sum(high))
-                    spread = np.hypot(low[1] - low[0], high[1] - high[0]) / np.sqrt(48.0)
-                    spread = float(np.hypot(spread, settings.position_sd_mm / np.sqrt(2.0)))
-                    return walker.placement("pattern-injection", where, edges, spread, echoes.peak)
-                message = "visit both sides first: the bar must shrink on each"
-                continue
-            where, echoes = walker.stop_at(decision.offset_mm)
-        raise PlacementError(f"not accepted after {_MOST_LOOKS} looks")
-
     try:
-        placement = procedure(search)(bench, settings, start_mm, watch)
+        with Walker(bench, settings, watch) as walker:
+            coarse(walker, start_mm)
+            placement = _followed(walker, injector, operator, frame, title)
     except BaseException:
         # A person must read the first error, not one of switching off.
         with contextlib.suppress(DeviceError):
@@ -302,3 +266,42 @@ def pattern_injection(
         raise
     injector.inject(False)
     return placement
+
+
+def _followed(
+    walker: Walker,
+    injector: Injector,
+    operator: Operator,
+    frame: Callable[[], Frame | None],
+    title: str,
+) -> Placement:
+    """The placement when the operator accepts one; arguments as of :func:`pattern_injection`."""
+    settings = walker.settings
+    first, message = len(walker.samples), ""
+    echoes = walker.listen()
+    for _ in range(_MOST_LOOKS):
+        if echoes.saturated(settings.full_scale):
+            raise PlacementError("the amplitude saturates: turn the gain down")
+        looks = walker.samples[first:]
+        loudest = max(peak for _, peak, _ in looks)
+        seen = tuple((at, bar_length(peak, loudest)) for at, peak, _ in looks)
+        view = View(seen, settings.fine_mm, frame, message, title)
+        lines = echoes.amplitude.shape[1]
+        injector.load_pattern(bar(view.length, echoes.loudest_line, lines))
+        injector.inject(True, _DELAY_TICKS)
+        decision = operator(view)
+        message = ""
+        if decision.what == "give-up":
+            raise SkippedError("the operator gave up the pose")
+        if decision.what == "accept":
+            low, high = flanks(seen, walker.where)
+            enough = all(sides_seen(seen)) and echoes.heard
+            if enough and low is not None and high is not None:
+                lower, upper = 0.5 * sum(low), 0.5 * sum(high)
+                spread = np.hypot(low[1] - low[0], high[1] - high[0]) / np.sqrt(48.0)
+                spread = float(np.hypot(spread, settings.position_sd_mm / np.sqrt(2.0)))
+                return walker.placement(0.5 * (lower + upper), 0.5 * (upper - lower), spread)
+            message = "visit both sides first: the bar must shrink on each"
+            continue
+        _, echoes = walker.stop_at(decision.offset_mm)
+    raise PlacementError(f"not accepted after {_MOST_LOOKS} looks")

@@ -12,14 +12,13 @@ placement is given up.
 from __future__ import annotations
 
 import contextlib
-import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from hw.midplane.bracket import Placement, widened
+from hw.midplane.bracket import Bracket, Placement
 from hw.runtime.errors import Device, DeviceError
 from jaxcal import InputError
 from jaxcal.runtime.array_types import Bool, Float
@@ -149,51 +148,56 @@ class Settings:
         if not 0 < self.top_fraction < 1:
             raise InputError("search: top_fraction must be between 0 and 1")
 
-    @property
-    def hidden_sd_mm(self) -> float:
-        """SD of the errors that no search sees: response's shift, last stop's repeatability; mm."""
-        return float(np.hypot(self.response_sd_mm, self.position_sd_mm))
+    def bracket(self, centre_mm: float, half_mm: float, sd_mm: float) -> Bracket:
+        """A bracket from what a search found and the independent errors that it cannot see.
 
+        Args:
+            centre_mm: best guess of the target's offset.
+            half_mm: from there to either edge as seen.
+            sd_mm: SD of the guess itself.
 
-@runtime_checkable
-class Procedure(Protocol):
-    """A way to place the probe, made by :func:`procedure`."""
-
-    def __call__(
-        self,
-        bench: Bench,
-        settings: Settings | None = None,
-        start_mm: float = 0.0,
-        watch: Watch | None = None,
-    ) -> Placement:
-        """Place the probe."""
-        ...
+        Returns:
+            Its ends: their distance from the centre is the root of the summed squares of
+            ``half_mm`` and of ``factor`` times the SD of the hidden errors.
+        """
+        # The response's shift, and the last stop's repeatability.
+        hidden = np.hypot(self.response_sd_mm, self.position_sd_mm)
+        half, sd = float(np.hypot(half_mm, self.factor * hidden)), float(np.hypot(sd_mm, hidden))
+        return Bracket(centre_mm, centre_mm - half, centre_mm + half, sd)
 
 
 class Walker:
-    """Moves and listens on behalf of one placement, and keeps its guards.
+    """Moves and listens on behalf of one placement, and keeps its guards; a context manager.
+
+    When a search within it gives up (:class:`PlacementError`), the probe is left at the last good
+    place. After any other error nothing is moved here.
 
     Args:
         bench: what to move and listen to.
-        settings: caps and steps.
+        settings: caps and steps; None: the default ones.
         watch: told of every stop.
     """
 
     def __init__(
-        self,
-        bench: Bench,
-        settings: Settings,
-        watch: Watch | None = None,
+        self, bench: Bench, settings: Settings | None = None, watch: Watch | None = None
     ) -> None:
-        self._bench, self.settings, self._watch = bench, settings, watch
+        self._bench, self._watch = bench, watch
+        self.settings = Settings() if settings is None else settings
         self._at: float | None = None
         self.where = 0.0
         self.good: float | None = None
         self._good_amplitude = 0.0
         self.threshold = -1
-        self.moves, self.frames, self.travel_mm = 0, 0, 0.0
+        self.moves, self.travel_mm = 0, 0.0
         self.samples: list[tuple[float, float, int]] = []
         self.notes: list[str] = []
+
+    def __enter__(self) -> Walker:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is not None and issubclass(kind, PlacementError):
+            self._leave()
 
     def _move(self, offset: float) -> None:
         settings = self.settings
@@ -231,7 +235,6 @@ class Walker:
     def listen(self) -> Echoes:
         """Listen where the probe stands; remembers the place if it is heard."""
         echoes = self._bench.read(self.settings.frames)
-        self.frames += len(echoes.amplitude)
         # A place where the response is much weaker is not kept as a good place.
         if echoes.heard and (self.good is None or echoes.peak >= 0.5 * self._good_amplitude):
             self.good, self._good_amplitude = self._at, echoes.peak
@@ -264,7 +267,7 @@ class Walker:
             "was: check the element, its threshold and the coupling"
         )
 
-    def leave(self) -> None:
+    def _leave(self) -> None:
         """Put the low threshold back and, if there is one, go to the last good place."""
         self.set_threshold(self.settings.low_threshold)
         if self.good is not None and self._at is not None and self._at != self.good:
@@ -273,61 +276,18 @@ class Walker:
             with contextlib.suppress(PlacementError):
                 self.go(self.good)
 
-    def placement(
-        self,
-        procedure: str,
-        offset: float,
-        edges: tuple[float, float],
-        sd_mm: float,
-        amplitude: float,
-    ) -> Placement:
-        """The result with the probe at ``offset``; ``edges`` bound the mid-plane's offset, mm."""
+    def placement(self, middle_mm: float, half_mm: float, sd_mm: float) -> Placement:
+        """The result where the probe stands.
+
+        Args:
+            middle_mm: offset of the mid-plane.
+            half_mm: from there to either edge as seen.
+            sd_mm: SD of the middle itself.
+        """
         # The target's offset in the image is the mid-plane's place minus the probe's.
-        low, high = edges[0] - offset, edges[1] - offset
-        bracket = widened(
-            0.5 * (low + high), low, high, sd_mm, self.settings.hidden_sd_mm, self.settings.factor
-        )
-        return Placement(
-            procedure,
-            bracket,
-            self.where,
-            amplitude,
-            self.threshold,
-            self.moves,
-            self.travel_mm,
-            self.frames,
-            np.array(self.samples, float).reshape(-1, 3),
-            tuple(self.notes),
-        )
-
-
-def procedure(search: Callable[[Walker, float], Placement]) -> Procedure:
-    """Make a procedure of a search by a :class:`Walker`.
-
-    The procedure takes a bench, settings (None: the default ones), where the mid-plane is expected
-    (an offset from the plan's pose, mm), and what is told of every stop. Its result is a placement
-    with the probe where the search has left it.
-
-    Raises:
-        PlacementError: the search's own, when it gives up: the probe is left at the last good
-            place. After any other error nothing is moved here.
-    """
-
-    @functools.wraps(search)
-    def placed(
-        bench: Bench,
-        settings: Settings | None = None,
-        start_mm: float = 0.0,
-        watch: Watch | None = None,
-    ) -> Placement:
-        walker = Walker(bench, Settings() if settings is None else settings, watch)
-        try:
-            return search(walker, start_mm)
-        except PlacementError:
-            walker.leave()
-            raise
-
-    return placed
+        bracket = self.settings.bracket(middle_mm - self.where, half_mm, sd_mm)
+        samples = np.array(self.samples, float).reshape(-1, 3)
+        return Placement(bracket, self.where, self.moves, samples, tuple(self.notes))
 
 
 def coarse(walker: Walker, start_mm: float = 0.0) -> float:
@@ -359,9 +319,19 @@ def coarse(walker: Walker, start_mm: float = 0.0) -> float:
     )
 
 
-@procedure
-def first_seen(walker: Walker, start_mm: float) -> Placement:
+def first_seen(
+    bench: Bench,
+    settings: Settings | None = None,
+    start_mm: float = 0.0,
+    watch: Watch | None = None,
+) -> Placement:
     """No placement: stop as soon as the element is heard, as conventional practice would.
+
+    Args:
+        bench: what to move and listen to.
+        settings: how to search; None: the default ones.
+        start_mm: where the mid-plane is expected, as an offset from the plan's pose.
+        watch: told of every stop.
 
     Returns:
         A placement whose bracket reaches as far as the element may be heard.
@@ -369,7 +339,7 @@ def first_seen(walker: Walker, start_mm: float) -> Placement:
     Raises:
         PlacementError: it is heard nowhere.
     """
-    offset = coarse(walker, start_mm)
-    half, amplitude = walker.settings.beam_half_mm, walker.samples[-1][1]
-    edges = (offset - half, offset + half)
-    return walker.placement("first-seen", offset, edges, half / np.sqrt(3.0), amplitude)
+    with Walker(bench, settings, watch) as walker:
+        coarse(walker, start_mm)
+        half = walker.settings.beam_half_mm
+        return walker.placement(walker.where, half, half / np.sqrt(3.0))

@@ -15,7 +15,7 @@ import numpy as np
 
 from hw.midplane.amplitude_scan import Peak, scan_up
 from hw.midplane.bracket import Placement
-from hw.midplane.search import PlacementError, Settings, Walker, coarse, procedure
+from hw.midplane.search import Bench, PlacementError, Settings, Walker, Watch, coarse
 
 _FIRST_FRACTION = 0.75
 _MOST_ROUNDS = 8
@@ -27,24 +27,14 @@ class Edges:
     """Where the response begins and ends at one threshold, mm.
 
     Attributes:
-        low_mm: where it begins.
-        high_mm: where it ends.
+        middle_mm: half way between.
+        half_mm: half of the stretch.
         sd_mm: standard deviation of the middle.
     """
 
-    low_mm: float
-    high_mm: float
+    middle_mm: float
+    half_mm: float
     sd_mm: float
-
-    @property
-    def middle_mm(self) -> float:
-        """Half way between."""
-        return 0.5 * (self.low_mm + self.high_mm)
-
-    @property
-    def half_mm(self) -> float:
-        """Half of the stretch."""
-        return 0.5 * (self.high_mm - self.low_mm)
 
 
 def find_edges(walker: Walker, middle_mm: float, half_mm: float) -> Edges | None:
@@ -84,7 +74,7 @@ def find_edges(walker: Walker, middle_mm: float, half_mm: float) -> Edges | None
     # From mean and number of the heard stops: random errors of the stops cancel in both.
     middle, half = float(np.mean(heard)), 0.5 * step * len(heard)
     spread = np.hypot(step / np.sqrt(24.0), settings.position_sd_mm / np.sqrt(2.0))
-    return Edges(middle - half, middle + half, float(spread))
+    return Edges(middle, half, float(spread))
 
 
 def climb(walker: Walker, peak: Peak) -> Edges:
@@ -123,9 +113,15 @@ def climb(walker: Walker, peak: Peak) -> Edges:
     return best
 
 
-@procedure
-def threshold_climb(walker: Walker, start_mm: float) -> Placement:
+def threshold_climb(
+    bench: Bench,
+    settings: Settings | None = None,
+    start_mm: float = 0.0,
+    watch: Watch | None = None,
+) -> Placement:
     """Coarse raster, fine scan, threshold climb; the probe ends half way between the loss edges.
+
+    Arguments as of :func:`hw.midplane.search.first_seen`.
 
     Returns:
         A placement whose bracket holds the last stretch, widened by the errors that no search sees.
@@ -133,28 +129,27 @@ def threshold_climb(walker: Walker, start_mm: float) -> Placement:
     Raises:
         PlacementError: given up, or the climb and the fine scan contradict each other.
     """
-    settings = walker.settings
-    peak = scan_up(walker, coarse(walker, start_mm), 2 * settings.fine_mm)
-    edges = climb(walker, peak)
-    if _apart(edges, peak, settings):
-        walker.notes.append("climb and loudest place disagreed; scanned and climbed once more")
-        walker.set_threshold(settings.low_threshold)
-        peak = scan_up(walker, peak.place_mm - settings.coarse_mm, settings.fine_mm)
+    with Walker(bench, settings, watch) as walker:
+        settings = walker.settings
+        peak = scan_up(walker, coarse(walker, start_mm), 2 * settings.fine_mm)
         edges = climb(walker, peak)
-    apart = _apart(edges, peak, settings)
-    if apart:
-        raise PlacementError(
-            f"the threshold climb ends {apart:+.2f} mm from the place of the largest amplitude: "
-            "the beam is asymmetric, or the target moved"
-        )
-    walker.set_threshold(settings.low_threshold)
-    where, echoes = walker.stop_at(edges.middle_mm)
-    if not echoes.heard:
-        walker.recover()
-        raise PlacementError("the response was lost at the place that the climb found")
-    return walker.placement(
-        "threshold-climb", where, (edges.low_mm, edges.high_mm), edges.sd_mm, echoes.peak
-    )
+        if _apart(edges, peak, settings):
+            walker.notes.append("climb and loudest place disagreed; scanned and climbed once more")
+            walker.set_threshold(settings.low_threshold)
+            peak = scan_up(walker, peak.place_mm - settings.coarse_mm, settings.fine_mm)
+            edges = climb(walker, peak)
+        apart = _apart(edges, peak, settings)
+        if apart:
+            raise PlacementError(
+                f"the threshold climb ends {apart:+.2f} mm from the place of the largest "
+                "amplitude: the beam is asymmetric, or the target moved"
+            )
+        walker.set_threshold(settings.low_threshold)
+        _, echoes = walker.stop_at(edges.middle_mm)
+        if not echoes.heard:
+            walker.recover()
+            raise PlacementError("the response was lost at the place that the climb found")
+        return walker.placement(edges.middle_mm, edges.half_mm, edges.sd_mm)
 
 
 def _apart(edges: Edges, peak: Peak, settings: Settings) -> float:

@@ -54,7 +54,7 @@ def plan_pool(
     candidates = make_candidates(count=_CANDIDATES, constraints=bounds, model=model, seed=seed + 1)
     best = plan(candidates, 2 * count, rules=BENCH_RULES).poses
     between = spread.poses[bounds.keeps(spread.poses, nominal, model.point)]
-    return in_order(np.concatenate([best, between]), scene, extent, spread.passed_over)
+    return in_order(np.concatenate([best, between]), scene, spread.passed_over)
 
 
 def allowed_by(limits: Limits, tcp_offset: tuple[float, ...] | None) -> Allowed:

@@ -17,6 +17,7 @@ this.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -89,14 +90,12 @@ class PosePlan:
         poses: (n, 4, 4) tool centre point -> base, mm.
         expected: (n, 2) where the target should then be in the image: [lateral, range], mm.
         scene: the scene that it was made for.
-        extent: the extent that it was made for.
         passed_over: poses of the sequence that left the box or the reach.
     """
 
     poses: Float[np.ndarray, "n 4 4"]
     expected: Float[np.ndarray, "n 2"]
     scene: Scene
-    extent: Extent
     passed_over: int = 0
 
     def __len__(self) -> int:
@@ -146,7 +145,7 @@ def plan_poses(count: int, scene: Scene, extent: Extent | None = None, seed: int
             f"only {len(poses)} of {count} poses stay inside the box and the reach: widen them, or "
             "narrow the cone"
         )
-    return in_order(poses, scene, extent, passed)
+    return in_order(poses, scene, passed)
 
 
 def constraints_of(scene: Scene, extent: Extent, allowed: Allowed | None = None) -> Constraints:
@@ -164,11 +163,11 @@ def constraints_of(scene: Scene, extent: Extent, allowed: Allowed | None = None)
     )
 
 
-def in_order(poses: np.ndarray, scene: Scene, extent: Extent, passed: int) -> PosePlan:
+def in_order(poses: np.ndarray, scene: Scene, passed: int) -> PosePlan:
     """A plan of poses in an order of short travel."""
     tour = _short_tour(poses, scene.tip_mm)
-    expected = np.array([scene.expected(pose)[[0, 2]] for pose in poses])
-    return PosePlan(poses[tour], expected[tour], scene, extent, passed)
+    expected = scene.expected(poses)[:, [0, 2]]
+    return PosePlan(poses[tour], expected[tour], scene, passed)
 
 
 def _short_tour(poses: np.ndarray, tip: np.ndarray) -> np.ndarray:
@@ -211,6 +210,17 @@ def _two_opt(tour: np.ndarray, cost: np.ndarray) -> np.ndarray:
     return tour
 
 
+def box_edges(box: Float[np.ndarray, "2 3"]) -> Float[np.ndarray, "12 2 3"]:
+    """The ends of a box's edges.
+
+    Args:
+        box: its lowest and highest corner.
+    """
+    corners = list(np.ndindex(2, 2, 2))
+    edges = [pair for pair in combinations(corners, 2) if np.not_equal(*pair).sum() == 1]
+    return box[np.array(edges), range(3)]
+
+
 def preview(plan: PosePlan, path: Path, box_mm: Float[np.ndarray, "2 3"] | None = None) -> None:
     """Write a figure of the plan: tips and axes in the base frame, cone, target over the image.
 
@@ -236,11 +246,8 @@ def preview(plan: PosePlan, path: Path, box_mm: Float[np.ndarray, "2 3"] | None 
     target = np.asarray(plan.scene.point_mm)[:, None]
     room.scatter(*target, color="red", marker="*", s=100, label="target")
     if box_mm is not None:
-        corners = box_mm[list(np.ndindex(2, 2, 2)), range(3)]
-        for k, one in enumerate(corners):
-            for other in corners[k + 1 :]:
-                if np.count_nonzero(one != other) == 1:
-                    room.plot(*np.stack([one, other], 1), color="tab:orange", linewidth=1.0)
+        for edge in box_edges(box_mm):
+            room.plot(*edge.T, color="tab:orange", linewidth=1.0)
         room.plot([], [], [], color="tab:orange", label="box for the probe")
         room.set_aspect("equal")
     room.legend(loc="upper left", fontsize=7, frameon=False)

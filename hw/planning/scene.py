@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jaxcal.data.poses import targets_in_images
 from jaxcal.runtime.array_types import Float
 
 
@@ -33,10 +34,9 @@ class Scene:
         """Unit vector of the image's elevational axis in the tool centre point's frame."""
         return self.image_to_probe[:3, 1]
 
-    def expected(self, pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, " 3"]:
+    def expected(self, pose: Float[np.ndarray, "*n 4 4"]) -> Float[np.ndarray, "*n 3"]:
         """Where the target should be in the image of a probe at ``pose``, by this scene, mm.
 
         The negative of the elevational coordinate is the probe's place along a free-hand sweep.
         """
-        in_tool = (self.point_mm - pose[:3, 3]) @ pose[:3, :3]
-        return (in_tool - self.tip_mm) @ self.image_to_probe[:3, :3]
+        return targets_in_images(pose, self.image_to_probe, self.point_mm)

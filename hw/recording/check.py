@@ -43,11 +43,14 @@ _MOST_MEMBERS = 100
 """Arrays in a group that is written once: ten times what an acquisition writes."""
 
 
-def check_resumable(path: str | os.PathLike[str]) -> None:
+def check_resumable(path: str | os.PathLike[str]) -> bool:
     """Check a file before it is opened for writing; it is not trusted, and not changed.
 
     A file that is shorter than its own superblock says (:func:`stored_length`) is read as if zeros
     were at its end. Text that the writer may touch is read, so that its heaps are checked too.
+
+    Returns:
+        Whether it came to its end before, without an image of every pose.
 
     Raises:
         FormatError: missing, not a recording, complete with all images, of another layout, with
@@ -56,7 +59,8 @@ def check_resumable(path: str | os.PathLike[str]) -> None:
     with opened(path) as root:
         if text(root, "format") != FORMAT or number(root, "version") != VERSION:
             raise FormatError("is not a recording of this version")
-        if flag(root, "complete") is not False and not _lacks_images(root):
+        complete = flag(root, "complete")
+        if complete is not False and not _lacks_images(root):
             raise FormatError("is complete: there is nothing to resume")
         for name, columns in LAYOUT.items():
             node = _existing(root, name)
@@ -74,17 +78,7 @@ def check_resumable(path: str | os.PathLike[str]) -> None:
                 for member in members(node, _MOST_MEMBERS):
                     stored_here(member)
                     check_attributes(member)
-
-
-def is_complete(path: str | os.PathLike[str]) -> bool:
-    """Whether a recording that can be resumed (:func:`check_resumable`) came to its end before.
-
-    Raises:
-        FormatError: it cannot be resumed.
-    """
-    check_resumable(path)
-    with opened(path) as root:
-        return flag(root, "complete") is True
+    return complete is True
 
 
 def _lacks_images(root: Node) -> bool:
@@ -107,7 +101,7 @@ class Progress:
         true_elevation: (k,) mm, NaN on a real bench.
         last_s: latest host time in the file.
         probe: numbers of /probe: elements, pitch_mm, sound_speed_m_s, delay_s.
-        electronics: see :func:`electronics_of`.
+        electronics: ``clock_hz`` and ``identity``, as far as it has them.
         ended: whether a run came to its end before, with poses skipped or given up.
     """
 
@@ -170,24 +164,14 @@ def settings_of(path: str | os.PathLike[str]) -> dict[str, object]:
         return _settings(root)
 
 
-def probe_of(path: str | os.PathLike[str]) -> dict[str, float]:
-    """Numbers of a recording's /probe, as in :class:`Progress`; the file is not trusted.
+def devices_of(path: str | os.PathLike[str]) -> tuple[dict[str, float], dict[str, object]]:
+    """Probe and electronics of a recording, as in :class:`Progress`; the file is not trusted.
 
     Raises:
         FormatError: not an acquisition's recording.
     """
     with opened(path) as root:
-        return _probe(root)
-
-
-def electronics_of(path: str | os.PathLike[str]) -> dict[str, object]:
-    """``clock_hz`` and ``identity`` of the electronics of a recording, as far as it has them.
-
-    Raises:
-        FormatError: not an acquisition's recording; the file is not trusted.
-    """
-    with opened(path) as root:
-        return _electronics(root)
+        return _probe(root), _electronics(root)
 
 
 @contextmanager

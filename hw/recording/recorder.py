@@ -22,7 +22,6 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
-from hw.recording.check import check_resumable
 from hw.recording.file import utc_now
 from hw.recording.layout import TEXT_BYTES, RecordingHeader
 from hw.runtime.processes import finish, spawn
@@ -31,6 +30,7 @@ from jaxcal import CalibrationError, FormatError, OutputError
 
 if TYPE_CHECKING:
     from hw.active_echo.device import EchoFrame
+    from hw.midplane.bracket import Bracket
     from hw.robot.stream import PoseSample
     from hw.ultrasound.receiver import Image
     from jaxcal.data.timing import ClockFit
@@ -67,8 +67,6 @@ class Recorder:
         queue_bytes: int = QUEUE_BYTES,
         patience_s: float = _PATIENCE_S,
     ) -> None:
-        if header is None:
-            check_resumable(path)
         self.path = os.fspath(path)
         self.dropped: dict[str, int] = {}
         """Rows of continuous data that found the queue full, by group."""
@@ -96,7 +94,7 @@ class Recorder:
         )
         self._listener.start()
         self._feeder.start()
-        self._put({"do": "open", "header": header})
+        self._put("open", header)
         try:
             self.rows: dict[str, int] = self._answer("open", _ENDING_S)["rows"]
             """Rows of every group when the file was opened; a resumed file holds some already."""
@@ -193,11 +191,10 @@ class Recorder:
         measurement: np.ndarray,
         *,
         kind: str,
-        max_elevation: float,
         amplitude: float,
         t_host: float,
         target: int,
-        bracket: tuple[float, float, float, float],
+        bracket: Bracket,
         offset: float = 0.0,
         true_elevation: float = float("nan"),
         seconds: float = 0.0,
@@ -208,11 +205,10 @@ class Recorder:
             pose: (4, 4) probe -> tracker, mm.
             measurement: (elements,) times of flight, s, or (2,) point, mm.
             kind: ``time_of_flight`` or ``point``, the recording's.
-            max_elevation: bound on |elevational offset|, mm.
             amplitude: received.
             t_host: s.
             target: row of the plan.
-            bracket: centre, low, high, sd of the target's elevational offset, mm.
+            bracket: of the target's elevational offset.
             offset: of the probe from the plan's pose along its elevational axis, mm.
             true_elevation: the emulated bench's truth, mm.
             seconds: how long the image took, in the bench's time.
@@ -223,20 +219,19 @@ class Recorder:
         self._row(
             "calibration",
             pose=pose,
-            max_elevation=max_elevation,
+            max_elevation=bracket.max_elevation_mm,
             amplitude=amplitude,
             mask=True,
             time=t_host,
             target=target,
             **{kind: measurement},
         )
-        centre, low, high, sd = bracket
         self._row(
             "placement",
-            centre=centre,
-            low=low,
-            high=high,
-            sd=sd,
+            centre=bracket.centre_mm,
+            low=bracket.low_mm,
+            high=bracket.high_mm,
+            sd=bracket.sd_mm,
             offset=offset,
             true_elevation=true_elevation,
             seconds=seconds,
@@ -268,7 +263,7 @@ class Recorder:
         Raises:
             OutputError: the writer failed, or did not answer in time.
         """
-        self._put({"do": "leave out", "row": row})
+        self._put("leave_out", row)
         self.sync()
 
     def add_estimate(self, **values: object) -> None:
@@ -277,19 +272,19 @@ class Recorder:
 
     def put(self, group: str, name: str, values: np.ndarray, unit: str) -> None:
         """Write one array of /plan, /test or /truth."""
-        self._put({"do": "put", "group": group, "name": name, "unit": unit}, {name: values})
+        self._put("put", group, name, values, unit)
 
     def copy(self, group: str, name: str, to_group: str, to_name: str) -> None:
         """Copy a whole column into an array of /plan, /test or /truth."""
-        self._put({"do": "copy", "from": [group, name], "to": [to_group, to_name]})
+        self._put("copy", group, name, to_group, to_name)
 
     def attributes(self, group: str, values: Mapping[str, Any]) -> None:
         """Set attributes of a group."""
-        self._put({"do": "attributes", "group": group, "values": dict(values)})
+        self._put("attributes", group, dict(values))
 
     def counts(self, group: str, values: Mapping[str, int]) -> None:
         """Set attributes of a group that count something in this run; runs add up."""
-        self._put({"do": "counts", "group": group, "values": dict(values)})
+        self._put("counts", group, dict(values))
 
     def sync(self) -> None:
         """Wait until everything handed over so far is on the disk.
@@ -300,7 +295,7 @@ class Recorder:
         self._note_drops()
         self._marks += 1
         mark = f"sync {self._marks}"
-        self._put({"do": "sync", "mark": mark})
+        self._put("sync", mark)
         self._answer(mark)
 
     def finish(self) -> str:
@@ -310,7 +305,7 @@ class Recorder:
             OutputError: the writer failed; the file is incomplete then.
         """
         self._note_drops()
-        self._put({"do": "finish"})
+        self._put("finish")
         digest = self._answer("finish")["sha256"]
         self._stop()
         return digest
@@ -339,26 +334,24 @@ class Recorder:
 
     def _stream(self, group: str, columns: Mapping[str, np.ndarray]) -> None:
         """Continuous rows: dropped and counted where there is no room."""
-        if not self._put({"do": "rows", "group": group}, columns, wait=False):
+        if not self._rows(group, columns, wait=False):
             count = len(next(iter(columns.values())))
             self.dropped[group] = self.dropped.get(group, 0) + count
 
     def _row(self, group: str, **values: object) -> None:
         columns = {name: np.asarray(value)[None] for name, value in values.items()}
-        self._put({"do": "rows", "group": group}, columns)
+        self._rows(group, columns, wait=True)
 
-    def _put(
-        self,
-        message: dict[str, Any],
-        columns: Mapping[str, np.ndarray] | None = None,
-        *,
-        wait: bool = True,
-    ) -> bool:
-        columns = dict(columns or {})
+    def _rows(self, group: str, columns: Mapping[str, np.ndarray], *, wait: bool) -> bool:
+        columns = dict(columns)
         for name in ("t_host", "time"):
             if name in columns:
                 columns[name] = columns[name] + self._time_offset
-        data = pickle.dumps((message, columns))
+        return self._put("append", group, columns, wait=wait)
+
+    def _put(self, do: str, *arguments: Any, wait: bool = True) -> bool:
+        """Queue a request (:mod:`hw.recording.writer_process`); False: there was no room."""
+        data = pickle.dumps((do, arguments))
         size = len(data)
         deadline = time.monotonic() + self._patience
         with self._changed:
@@ -443,8 +436,8 @@ class Recorder:
                 self.kept = answer["kept"]
                 continue
             if "error" in answer:
-                kinds = {"FormatError": FormatError}
-                self._fail(kinds.get(answer["kind"], OutputError)(answer["error"]))
+                kind = FormatError if answer["format"] else OutputError
+                self._fail(kind(answer["error"]))
                 continue
             with self._changed:
                 self._answers[answer["mark"]] = answer

@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,7 +20,6 @@ from hw.robot.stream import offset_changed
 from hw.runtime.errors import RefusedError, refused
 from hw.setup.description import Setup
 from jaxcal import InputError
-from jaxcal.data.probe import LinearProbe
 from jaxcal.runtime.messages import quoted
 
 if TYPE_CHECKING:
@@ -32,28 +32,13 @@ _LONGEST_IDENTITY = 200
 
 def described(setup: Setup, targets: np.ndarray) -> dict[str, Any]:
     """What a recording keeps of its bench, ready for JSON: probe, scene, limits, plan."""
-    scene = setup.scene
     content = {
-        "probe": described_probe(setup.probe),
-        "scene": {
-            "image_to_probe": scene.image_to_probe.tolist(),
-            "point_mm": scene.point_mm.tolist(),
-            "looking": scene.looking.tolist(),
-        },
+        "probe": asdict(setup.probe),
+        "scene": {name: value.tolist() for name, value in vars(setup.scene).items()},
         "limits": dict(setup.limits),
         "plan_sha256": hashlib.sha256(np.ascontiguousarray(targets, float).tobytes()).hexdigest(),
     }
     return json.loads(json.dumps(content))
-
-
-def described_probe(probe: LinearProbe) -> dict[str, int | float]:
-    """Numbers of a probe, as in a recording's /probe and a setup's [probe]."""
-    return {
-        "elements": probe.elements,
-        "pitch_mm": probe.pitch_mm,
-        "sound_speed_m_s": probe.sound_speed_m_s,
-        "delay_s": probe.delay_s,
-    }
 
 
 def check_same(table: str, kept: object, now: Mapping[str, Any]) -> None:
@@ -92,11 +77,9 @@ def compare(progress: Progress, setup: Setup) -> list[str]:
     before = progress.settings.get("bench")
     before = before if isinstance(before, dict) else {}
     # The calibration uses the file's own /probe; recordings older than this check have it too.
-    for table, kept in (
-        ("probe", progress.probe),
-        *((t, before.get(t)) for t in ("probe", "scene")),
-    ):
-        check_same(table, kept, now[table])
+    check_same("probe", progress.probe, now["probe"])
+    for table in ("probe", "scene"):
+        check_same(table, before.get(table), now[table])
     changes = []
     limits = before.get("limits")
     if isinstance(limits, dict):

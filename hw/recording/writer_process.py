@@ -1,8 +1,9 @@
 """The process that writes a recording: messages on standard input, answers on standard output.
 
-Started by :class:`hw.recording.recorder.Recorder` only. It flushes new data to the file within
-about a second. When its standard input ends, the acquisition is gone, and it closes the file in
-order.
+Started by :class:`hw.recording.recorder.Recorder` only. A message is the name of a method of
+:class:`hw.recording.file.RecordingWriter` (or ``open``, ``sync``, ``finish``) and its arguments.
+New data are flushed to the file within about a second. When its standard input ends, the
+acquisition is gone, and it closes the file in order.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from typing import Any
 
 from hw.recording.file import RecordingWriter
 from hw.runtime.interrupts import ENDING
-from jaxcal import CalibrationError
+from jaxcal import CalibrationError, FormatError
 from jaxcal.io.given_files import one_line
 
 FLUSH_S = 1.0
@@ -48,12 +49,12 @@ def main(path: str) -> int:
     sys.unraisablehook = sys.excepthook = lambda *_: None
     writer = None
     try:
-        messages: queue.Queue[tuple[dict, dict] | None] = queue.Queue(_MOST_WAITING)
+        messages: queue.Queue[tuple[str, tuple] | None] = queue.Queue(_MOST_WAITING)
         threading.Thread(target=_receive, args=(messages,), daemon=True).start()
         first = messages.get()
         if first is None:
             return 0
-        header = first[0]["header"]
+        _, (header,) = first
         if header is None:
             writer = RecordingWriter.resume(path)
         else:
@@ -66,7 +67,7 @@ def main(path: str) -> int:
         # A vanished disk: h5py has many exceptions for it.
         line = str(error) if known else f"{path}: cannot be written: {one_line(error)}"
         # Tell it first, so that the robot is stopped; the file is rescued after that.
-        answer(error=line, kind=type(error).__name__ if known else "OutputError")
+        answer(error=line, format=isinstance(error, FormatError))
         if writer is not None:
             with suppress(CalibrationError, OSError):
                 answer(kept=os.fspath(writer.rescue()))
@@ -102,29 +103,17 @@ def _serve(writer: RecordingWriter, messages: queue.Queue, answer: Callable[...,
             return
         if not received:
             continue
-        message, columns = received
+        do, arguments = received
         due = time.monotonic() + FLUSH_S if due is None else due
-        match message["do"]:
-            case "rows":
-                writer.append(message["group"], columns)
-            case "put":
-                name = message["name"]
-                writer.put(message["group"], name, columns[name], message["unit"])
-            case "leave out":
-                writer.leave_out(message["row"])
-            case "copy":
-                writer.copy(*message["from"], *message["to"])
-            case "attributes":
-                writer.attributes(message["group"], message["values"])
-            case "counts":
-                writer.counts(message["group"], message["values"])
-            case "sync":
-                writer.flush(durable=True)
-                due = None
-                answer(mark=message["mark"])
-            case "finish":
-                answer(mark="finish", sha256=writer.finish())
-                return
+        if do == "sync":
+            writer.flush(durable=True)
+            due = None
+            answer(mark=arguments[0])
+        elif do == "finish":
+            answer(mark="finish", sha256=writer.finish())
+            return
+        else:
+            getattr(writer, do)(*arguments)
 
 
 if __name__ == "__main__":

@@ -195,17 +195,8 @@ def joint_points(model: ArmModel, joints: Float[np.ndarray, "*n 6"]) -> Float[np
     """
     frames = link_frames(model, joints)
     elbow, axis = frames[..., 2, :3, 3], frames[..., 2, :3, 2]
-    return np.stack(
-        [
-            elbow,
-            elbow + model.elbow_mm * axis,
-            frames[..., 3, :3, 3],
-            frames[..., 4, :3, 3],
-            frames[..., 5, :3, 3],
-            frames[..., 6, :3, 3],
-        ],
-        axis=-2,
-    )
+    sides = np.stack([elbow, elbow + model.elbow_mm * axis], axis=-2)
+    return np.concatenate([sides, frames[..., 3:, :3, 3]], axis=-2)
 
 
 POINT_NAMES = ("elbow", "elbow", "wrist 1", "wrist 2", "wrist 3", "flange")

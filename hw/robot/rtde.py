@@ -247,7 +247,6 @@ class PacketReader:
         self._data = bytearray()
         self._kept: list[bytes] = []
         """The packet that came while connecting."""
-        self._pendant = PendantSettings()
         try:
             self._socket = socket.create_connection((host, PORT), timeout=timeout_s)
         except (OSError, UnicodeError) as error:
@@ -306,8 +305,6 @@ class PacketReader:
         pendant = PendantSettings(
             told.get("payload"), told.get("payload_cog"), told["target_speed_fraction"]
         )
-        if pendant != self._pendant:
-            self._pendant = pendant
         return Packet(
             now,
             told["timestamp"],
@@ -319,7 +316,7 @@ class PacketReader:
             told["robot_status_bits"],
             told["safety_status_bits"],
             told.get("tcp_offset"),
-            self._pendant,
+            pendant,
             told.get("actual_q"),
         )
 

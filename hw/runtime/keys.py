@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import os
 import queue
+import re
 import select
 import sys
 import threading
@@ -29,24 +30,14 @@ _NAMES = {
     b"\x1b[5~": "pageup",
     b"\x1b[6~": "pagedown",
 }
+_KEY = re.compile(rb"\x1b[\[O][^A-Za-z~]*[A-Za-z~]?|.", re.DOTALL)
+"""A control sequence, which ends with its first letter or tilde, or a single byte."""
 
 
 def names_of(typed: bytes) -> list[str]:
     """Names of the keys in what a terminal sent at once; unknown control sequences are left out."""
     names = []
-    while typed:
-        size = next((n for n in (4, 3) if typed[:n] in _NAMES), 1)
-        if size == 1 and typed[:1] == b"\x1b" and typed[1:2] in (b"[", b"O"):
-            # A control sequence ends with its first letter or tilde.
-            size = 2
-            while size < len(typed) and not (
-                typed[size : size + 1].isalpha() or typed[size] == 126
-            ):
-                size += 1
-            typed = typed[size + 1 :]
-            continue
-        key = typed[:size]
-        typed = typed[size:]
+    for key in _KEY.findall(typed):
         if key in _NAMES:
             names.append(_NAMES[key])
         elif key.isascii() and key.decode().isprintable():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import select
 import subprocess
 import sys
 from typing import IO
@@ -30,6 +31,13 @@ def spawn(
         stderr=stderr,
         start_new_session=True,
     )
+
+
+def first_line(process: subprocess.Popen[bytes], patience_s: float) -> bytes:
+    """The first line of a process's output; empty where none comes within so many wall s."""
+    assert process.stdout is not None
+    ready = select.select([process.stdout], [], [], patience_s)[0]
+    return process.stdout.readline() if ready else b""
 
 
 def finish(process: subprocess.Popen[bytes], patience_s: float | None) -> bool:

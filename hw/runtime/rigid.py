@@ -1,60 +1,29 @@
 """Rotations and rigid transforms in plain numpy, beside those of :mod:`jaxcal.data.poses`.
 
-Rotation vectors are axis times angle (rad); quaternions are (w, x, y, z) of unit length; transforms
-are 4x4 with translations in mm. Numpy only: the small processes that talk to devices start without
-JAX and scipy.
+Rotation vectors are axis times angle (rad); transforms are 4x4 with translations in mm. Numpy only:
+the small processes that talk to devices start without JAX and scipy.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from jaxcal.data.poses import rotation_angle, rotations_from_vectors
+from jaxcal.data.poses import (
+    quaternions_from_rotations,
+    rotation_angle,
+    rotations_from_vectors,
+)
 from jaxcal.runtime.array_types import Float
 
 
 def rotation_vector(rotation: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n 3"]:
     """Rotation vectors (rad, at most pi long) of orthonormal matrices."""
-    quaternion = matrix_to_quaternion(rotation)
-    vector = quaternion[..., 1:]
+    quaternion = quaternions_from_rotations(rotation)
+    vector = quaternion[..., :3]
     sine = np.sqrt(np.sum(vector * vector, axis=-1, keepdims=True))
-    angle = 2.0 * np.arctan2(sine, quaternion[..., :1])
+    angle = 2.0 * np.arctan2(sine, quaternion[..., 3:])
     tiny = sine < 1e-9
     return vector * np.where(tiny, 2.0, angle / np.where(tiny, 1.0, sine))
-
-
-def matrix_to_quaternion(rotation: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n 4"]:
-    """Unit quaternions, w >= 0, of orthonormal matrices.
-
-    The largest component is taken from the diagonal (Shepperd 1978), which keeps its digits at half
-    a turn, where the skew part vanishes.
-    """
-    r = np.asarray(rotation, dtype=np.float64)
-    a, b, c = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
-    yz, zx, xy = (
-        r[..., 2, 1] - r[..., 1, 2],
-        r[..., 0, 2] - r[..., 2, 0],
-        r[..., 1, 0] - r[..., 0, 1],
-    )
-    pxy, pzx, pyz = (
-        r[..., 1, 0] + r[..., 0, 1],
-        r[..., 0, 2] + r[..., 2, 0],
-        r[..., 2, 1] + r[..., 1, 2],
-    )
-    # Rows: 4 q_k times the quaternion (w, x, y, z), for k = w, x, y, z.
-    rows = np.stack(
-        [
-            np.stack([1 + a + b + c, yz, zx, xy], axis=-1),
-            np.stack([yz, 1 + a - b - c, pxy, pzx], axis=-1),
-            np.stack([zx, pxy, 1 - a + b - c, pyz], axis=-1),
-            np.stack([xy, pzx, pyz, 1 - a - b + c], axis=-1),
-        ],
-        axis=-2,
-    )
-    best = np.argmax(np.diagonal(rows, axis1=-2, axis2=-1), axis=-1)
-    quaternion = np.take_along_axis(rows, best[..., None, None], axis=-2)[..., 0, :]
-    quaternion = quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
-    return np.where(quaternion[..., :1] < 0, -quaternion, quaternion)
 
 
 def turn_deg(first: Float[np.ndarray, "4 4"], second: Float[np.ndarray, "4 4"]) -> float:

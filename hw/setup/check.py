@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,14 +39,11 @@ def check(setup: Setup, seconds: float = 2.0) -> list[Finding]:
         setup: where they are.
         seconds: to watch each stream.
     """
-    looks: list[tuple[str, Callable[[Setup, float], Finding]]] = [
-        ("robot", _robot),
-        ("active echo", _active_echo),
-    ]
+    looks = {"robot": _robot, "active echo": _active_echo}
     if setup.ultrasound is not None:
-        looks.append(("ultrasound", _ultrasound))
+        looks["ultrasound"] = _ultrasound
     found = []
-    for name, look in looks:
+    for name, look in looks.items():
         try:
             found.append(look(setup, seconds))
         except DeviceError as error:

@@ -111,8 +111,8 @@ class Setup:
             raise refused(
                 f"the setup is for a {model}, but the controller is that of a {controller_model}"
             )
-        width = self.probe.elements * self.probe.pitch_mm
-        hull = hull_of(self.scene.image_to_probe, *(self.housing_mm or (width, *_HOUSING_MM)))
+        housing = self.housing_mm or (self.probe.width_mm, *_HOUSING_MM)
+        hull = hull_of(self.scene.image_to_probe, *housing)
         return Limits.from_mapping(
             {"hull_mm": hull, **self.limits, "tip_mm": tip.tolist(), "arm_model": model}
         )
@@ -264,7 +264,8 @@ def _setup(tables: dict[str, Any]) -> Setup:
         if not all(1.0 <= value <= FURTHEST_TIP_MM for value in housing):
             raise InputError(f"[probe] housing_mm must be 1 to {FURTHEST_TIP_MM:g} mm each")
     echo = found["active_echo"]
-    if not 1 <= echo.get("frames", 9) <= 1000:
+    frames = echo.get("frames", Setup.frames)
+    if not 1 <= frames <= 1000:
         raise InputError("[active_echo] frames must be 1 to 1000")
     plan = {
         key: _as_tuple(_numbers(key, value, _PLAN_SHAPES[key], "plan").tolist())
@@ -274,7 +275,7 @@ def _setup(tables: dict[str, Any]) -> Setup:
     }
     setup = Setup(
         active_echo_url=echo["url"],
-        frames=echo.get("frames", 9),
+        frames=frames,
         ultrasound=ultrasound,
         scene=Scene(
             _drawn(scene["image_to_probe"]),
@@ -356,7 +357,7 @@ def _check_lengths(setup: Setup, tip_at_tcp: bool) -> None:
 
 
 def _check_width(probe: LinearProbe) -> None:
-    width = probe.elements * probe.pitch_mm
+    width = probe.width_mm
     if not _WIDTH_MM[0] <= width <= _WIDTH_MM[1]:
         raise InputError(
             f"[probe] elements and pitch_mm make an array {width:g} mm wide: pitch_mm is in mm, "

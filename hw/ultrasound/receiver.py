@@ -18,6 +18,7 @@ import numpy as np
 from hw.runtime.clock import REAL, Clock, Lag
 from hw.runtime.errors import Device, DeviceError, LostError, StaleError
 from hw.ultrasound.framing import MessageDecoder
+from jaxcal.data.poses import ROTATION_TOLERANCE, nearest_rotations
 from jaxcal.io.given_files import one_line
 from jaxcal.io.message_content import Picture, Pixels, StatusMessage, Tracked, TrackedFrame
 from jaxcal.io.openigtlink import PORT, RF_DEVICE, Message
@@ -28,8 +29,6 @@ DEVICE: Device = "ultrasound"
 _CONNECT_TIMEOUT_S = 5.0
 _POLL_S = 0.05
 _CHUNK = 1 << 18
-# As jaxcal.data.geometry takes it; that module would bring JAX into a process that only receives.
-_ROTATION_TOLERANCE = 1e-2
 _QUEUE_BYTES = 256 << 20
 
 
@@ -354,7 +353,6 @@ class UltrasoundStream:
 
 def _is_rigid(matrix: Float[np.ndarray, "4 4"]) -> bool:
     rotation = matrix[:3, :3]
-    if not np.isfinite(matrix).all() or np.abs(rotation).max() > 2 or np.linalg.det(rotation) <= 0:
+    if not np.isfinite(matrix).all() or np.abs(rotation).max() > 2:
         return False
-    # |R^T R - 1| is twice the distance from the nearest rotation, to first order.
-    return bool(np.linalg.norm(rotation.T @ rotation - np.eye(3)) <= 2 * _ROTATION_TOLERANCE)
+    return bool(nearest_rotations(rotation[None])[1][0] <= ROTATION_TOLERANCE)

@@ -25,7 +25,7 @@ from hw.recording.session import Session
 from hw.robot.motion_plan import MotionPlan
 from hw.runtime.errors import DeviceError
 from hw.runtime.extras import missing
-from hw.runtime.processes import finish, spawn
+from hw.runtime.processes import finish, first_line, spawn
 from hw.setup.description import Setup
 from jaxcal import InputError
 from jaxcal.result.calibration import Calibration
@@ -250,16 +250,12 @@ class LiveView(Audience):
 
     def _greeting(self) -> str:
         """Wait for the viewer; returns the address that it prints once its page can be opened."""
-        process = self._process
-        assert process.stdout is not None
-        line = b""
-        if select.select([process.stdout], [], [], _START_WALL_S)[0]:
-            line = process.stdout.readline()
+        line = first_line(self._process, _START_WALL_S)
         told = json.loads(line) if line else {}
         if "url" in told:
             return told["url"]
-        process.kill()
-        process.communicate()
+        self._process.kill()
+        self._process.communicate()
         why = told.get("error", "no reason given")
         raise InputError(f"view: the viewer did not start: {why}")
 

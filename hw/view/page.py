@@ -8,12 +8,12 @@ flange to the pose (:mod:`hw.robot.kinematics`).
 from __future__ import annotations
 
 from html import escape
-from itertools import product
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from hw.planning.poses import box_edges
 from hw.robot.kinematics import (
     MODELS,
     ArmModel,
@@ -23,6 +23,7 @@ from hw.robot.kinematics import (
     model_named,
     nearest,
 )
+from hw.runtime.rigid import looking_rotation
 from jaxcal.runtime.array_types import Float, UInt8
 
 UNIT_MM = 100.0
@@ -56,14 +57,6 @@ _LEGEND = (
 def quaternion(rotation: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n 4"]:
     """Unit quaternions (w, x, y, z) of rotation matrices."""
     return Rotation.from_matrix(rotation).as_quat(scalar_first=True)
-
-
-def towards(direction: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
-    """Rotations whose z axes point along directions."""
-    z = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
-    x = np.cross(np.eye(3)[np.argmin(np.abs(z), axis=-1)], z)
-    x /= np.linalg.norm(x, axis=-1, keepdims=True)
-    return np.stack([x, np.cross(z, x), z], axis=-1)
 
 
 def ellipsoid(
@@ -164,13 +157,13 @@ class Page:
         self._parts.clear()
         self._joints = self._frame = None
         self._drawn, self._lengths = np.zeros((4, 4)), np.zeros(0)
-        low, high = np.array(told["box"]) / UNIT_MM
+        low, high = box = np.array(told["box"]) / UNIT_MM
         middle = np.array(told["point"]) / UNIT_MM
         scene.add_grid(
             "/floor", width=12.0, height=12.0, cell_size=1.0, section_size=5.0, infinite_grid=False
         )
         self._parts["box"] = scene.add_line_segments(
-            "/box", _edges(low, high), (60, 110, 220), thickness=2.0, thickness_units="screen"
+            "/box", box_edges(box), (60, 110, 220), thickness=2.0, thickness_units="screen"
         )
         self._parts["box label"] = scene.add_label(
             "/box/label",
@@ -267,7 +260,8 @@ class Page:
         lengths = np.linalg.norm(ways, axis=1)
         middles = (points[:-1] + 0.5 * ways) / UNIT_MM
         # Links shorter than a mm are not shown; any direction will do for them.
-        turns = quaternion(towards(np.where(lengths[:, None] > 1.0, ways, [0.0, 0.0, 1.0])))
+        directions = np.where(lengths[:, None] > 1.0, ways, [0.0, 0.0, 1.0])
+        turns = quaternion(np.array([looking_rotation(way) for way in directions]))
         if len(lengths) != len(self._lengths) or np.abs(lengths - self._lengths).max() > 0.1:
             self._lengths = lengths
             for number in range(len(_LINK_RADIUS_MM)):
@@ -339,12 +333,6 @@ class Page:
         usable = estimate is not None and estimate["status"] == "converged"
         source = estimate if estimate is not None and usable else self._told
         return np.reshape(source["image_to_probe"], (4, 4)).astype(float)
-
-
-def _edges(low: np.ndarray, high: np.ndarray) -> Float[np.ndarray, "12 2 3"]:
-    corners = np.array(list(product(*zip(low, high, strict=True))))
-    pairs = [(a, b) for a, b in product(range(8), repeat=2) if a < b and (a ^ b) in (1, 2, 4)]
-    return corners[np.array(pairs)]
 
 
 def state_words(told: dict[str, Any]) -> str:

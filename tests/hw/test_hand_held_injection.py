@@ -414,15 +414,11 @@ def test_options_that_belong_together(tmp_path):
 
 
 def test_advice():
-    def view(seen, at):
-        lengths = [length for _, length in seen]
-        return View(seen[-1][1], max(lengths), at, 0.0, 100.0, tuple(seen))
-
     profile = [(x / 2, max(0, 31 - abs(x) * 4)) for x in range(-6, 7)]
-    assert "down (-)" in hand_advice(view(profile[6:9], 1.0), 0.0)
-    assert "up (+) through" in hand_advice(view(profile[:8], 0.5), 0.0)
-    assert hand_advice(view(profile, 3.0), 0.0).startswith("go 3.0 mm down")
-    there = view([*profile, (0.1, 31)], 0.1)
+    assert "down (-)" in hand_advice(View(tuple(profile[6:9])), 0.0)
+    assert "up (+) through" in hand_advice(View(tuple(profile[:8])), 0.0)
+    assert hand_advice(View(tuple(profile)), 0.0).startswith("go 3.0 mm down")
+    there = View((*profile, (0.1, 31)))
     assert "Enter accepts" in hand_advice(there, 0.0)
 
 

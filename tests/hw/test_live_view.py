@@ -97,7 +97,7 @@ ADVICE = {
 
 def test_the_advice_brings_back_who_lost_the_pattern():
     """Above it, so the way is down; and whoever only saw one side is not told to accept."""
-    view = View(0, 20, 3.0, 0.25, 0.0, ((0.0, 20), (1.0, 12), (3.0, 0)))
+    view = View(((0.0, 20), (1.0, 12), (3.0, 0)), 0.25)
     assert advice(view).startswith("The pattern is gone here. Step down")
 
 
@@ -177,7 +177,7 @@ def test_a_closed_window_ends_the_run():
     figure = Figure()
     canvas = FigureCanvasAgg(figure)
     window = WindowOperator(figure)
-    view = View(5, 10, 1.0, 0.25, 900.0, ((1.0, 5),), frame=lambda: None)
+    view = View(((1.0, 5),), 0.25, frame=lambda: None)
     closed = CloseEvent("close_event", canvas)
     canvas.start_event_loop = lambda timeout: canvas.callbacks.process("close_event", closed)
     for _ in range(2):
@@ -194,7 +194,7 @@ def test_an_interrupt_that_the_window_drops_ends_the_wait():
 
     figure = Figure()
     FigureCanvasAgg(figure)
-    view = View(5, 10, 1.0, 0.25, 900.0, ((1.0, 5),), frame=frame)
+    view = View(((1.0, 5),), 0.25, frame=frame)
     with as_interrupts(), pytest.raises(KeyboardInterrupt):
         WindowOperator(figure)(view)
 
@@ -207,7 +207,7 @@ def test_s_skips_the_pose():
 
 def test_steps_change_and_unknown_keys_do_nothing():
     keys = Keys()
-    view = View(5, 10, 1.0, 0.25, 900.0, ((1.0, 5),))
+    view = View(((1.0, 5),), 0.25)
     assert keys.decide("x", view) is None
     assert keys.decide("-", view) is None
     decision = keys.decide("up", view)

@@ -7,8 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hw.acquisition.live_estimate import Estimator
 from hw.acquisition.planner import Planner
+from hw.bench.stage import WorldStage
 from hw.bench.world import make_world
+from hw.midplane.search import Settings
+from hw.midplane.threshold_climb import threshold_climb
 from hw.planning.pool import allowed_by, plan_pool
 from hw.planning.poses import Extent, plan_poses, preview
 from hw.planning.scene import Scene
@@ -110,6 +114,14 @@ def test_preview_is_a_figure(tmp_path):
     assert without.startswith(b"\x89PNG")
     preview(plan, path, np.array([[180.0, -420.0, 40.0], [520.0, -80.0, 270.0]]))
     assert path.read_bytes() != without
+
+
+def test_what_the_placement_noted_is_told_with_the_image():
+    world = make_world(0)
+    stage = WorldStage(world, plan_poses(1, SCENE).poses[0], np.random.default_rng(0))
+    placement = threshold_climb(stage, Settings(epsilon_mm=0.3))
+    line = Estimator(4, a_setup(), None).line(4, placement)
+    assert "the beam is too thick for +-0.3 mm" in line
 
 
 def a_setup(**changes) -> Setup:

@@ -19,6 +19,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import jaxcal
+from hw.midplane.bracket import Bracket
 from hw.recording.check import check_resumable, settings_of
 from hw.recording.file import RecordingWriter
 from hw.recording.layout import RecordingHeader
@@ -82,8 +83,8 @@ def echo(start: int, count: int) -> list[SimpleNamespace]:
 def take(recorder: Recorder, images: SimpleNamespace, index: int) -> None:
     recorder.add_selected(
         images.poses[index], images.times[index], kind="time_of_flight",
-        max_elevation=0.5, amplitude=900.0, t_host=float(index), target=index,
-        bracket=(0.0, -0.5, 0.5, 0.2), seconds=4.0,
+        amplitude=900.0, t_host=float(index), target=index, bracket=Bracket(0.0, -0.5, 0.5, 0.2),
+        seconds=4.0,
     )  # fmt: skip
 
 

@@ -34,14 +34,13 @@ from hw.robot.motion_plan import MotionPlan
 from hw.robot.stream import PoseSample
 from hw.runtime.errors import LostError, StaleError
 from hw.runtime.extras import missing
+from hw.runtime.rigid import looking_rotation
 from hw.setup.description import Setup
 from hw.setup.emulated import setup_of, start
 from hw.view.feed import LiveView, halved, watched
-from hw.view.page import ellipsoid, to_scale, towards
+from hw.view.page import ellipsoid, to_scale
 
-PLACEMENT = Placement(
-    "none", Bracket(0.1, -0.7, 0.9, 0.3), 0.1, 800.0, 100, 3, 1.0, 9, np.zeros((0, 3))
-)
+PLACEMENT = Placement(Bracket(0.1, -0.7, 0.9, 0.3), 0.1, 3, np.zeros((0, 3)))
 
 
 def wait_until(condition, timeout_s: float = 180.0) -> None:
@@ -261,10 +260,10 @@ def test_a_browser_sees_the_bench_move_and_killing_the_view_changes_nothing(benc
 def test_geometry_of_the_page():
     rng = np.random.default_rng(0)
     for _ in range(20):
-        rotation = towards(rng.normal(size=3))
+        rotation = looking_rotation(rng.normal(size=3))
         assert np.linalg.det(rotation) == pytest.approx(1.0)
         np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
-    turned = towards(np.array([1.0, 2.0, 3.0]))
+    turned = looking_rotation(np.array([1.0, 2.0, 3.0]))
     half, axes, magnified = ellipsoid(turned @ np.diag([0.01, 0.04, 0.09]) @ turned.T)
     # 2.795 SDs hold 95 % in three dimensions.
     np.testing.assert_allclose(half / magnified, 2.7955 * np.array([0.1, 0.2, 0.3]), rtol=1e-4)

@@ -77,7 +77,8 @@ class Inputs:
         self._packet: Packet | None = None
         self._sample: PoseSample | None = None
         self._unseen: list[Packet] = []
-        self._pendant: PendantSettings | None = None
+        self.pendant: PendantSettings | None = None
+        """The newest settings at the pendant."""
         self.latch = StopLatch()
         self.moves: deque[dict] = deque()
         """Requests to move that wait."""
@@ -115,11 +116,6 @@ class Inputs:
         assert self._sample is not None
         return self._sample
 
-    @property
-    def pendant(self) -> PendantSettings | None:
-        """The newest settings at the pendant."""
-        return self._pendant
-
     def unseen(self) -> list[Packet]:
         """Packets since the last call, in order; the newest one if none has come."""
         packets, self._unseen = self._unseen, []
@@ -153,10 +149,10 @@ class Inputs:
         # In every packet: the newest one may already tell of another program.
         self.program_ended |= self.program_started and not packet.program
         self._sample = PoseSample.of(packet, self._clock, self._lag)
-        changed = "" if self._pendant is None else self._pendant.changed(packet.pendant)
+        changed = "" if self.pendant is None else self.pendant.changed(packet.pendant)
         if changed:
             self._refuse(f"changed at the pendant: {changed}")
-        self._pendant = packet.pendant
+        self.pendant = packet.pendant
         if packet.tcp_offset is not None:
             if self.tcp_offset is not None and offset_changed(self.tcp_offset, packet.tcp_offset):
                 self._refuse("the controller's TCP offset was changed")

@@ -273,6 +273,7 @@ WRITE = """
 import sys
 from types import SimpleNamespace
 import numpy as np
+from hw.midplane.bracket import Bracket
 from hw.recording.recorder import Recorder
 from hw.recording.layout import RecordingHeader
 from jaxcal import CalibrationError
@@ -284,8 +285,8 @@ try:
         recorder.add_images([SimpleNamespace(t_host=k, t_device=k, frame_id=k, array=frame)])
         if k % 20 == 0:
             recorder.add_selected(
-                np.eye(4), np.full(8, 4e-5), kind="time_of_flight", max_elevation=1.0,
-                amplitude=1.0, t_host=k, target=k // 20, bracket=(0.0, -1.0, 1.0, 0.5),
+                np.eye(4), np.full(8, 4e-5), kind="time_of_flight", amplitude=1.0,
+                t_host=k, target=k // 20, bracket=Bracket(0.0, -1.0, 1.0, 0.5),
             )
             print(k // 20 + 1, flush=True)
             input()
