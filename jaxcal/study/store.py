@@ -29,9 +29,10 @@ import numpy as np
 from jaxcal import FormatError, InputError, MissingFileError
 from jaxcal.io.atomic import made_folder, write_bytes, write_text
 from jaxcal.io.given_files import check_readable, one_line, path_name
+from jaxcal.io.toml import MAXIMUM_BYTES
 from jaxcal.io.untrusted import array, child, number, open_root, text
 from jaxcal.study.interface import Chunk, Study
-from jaxcal.study.spec import MAXIMUM_BYTES, Spec
+from jaxcal.study.spec import Spec
 
 FORMAT = "jaxcal-study-chunk"
 VERSION = 1
