@@ -115,11 +115,6 @@ def exit_code(records: Iterable[dict[str, Any]]) -> ExitCode:
     return ExitCode.CONVERGED if converged else ExitCode.NOT_CONVERGED
 
 
-def import_code(most_lost: bool) -> ExitCode:
-    """3 where most frames, or points of another file, had to be left out."""
-    return ExitCode.NOT_CONVERGED if most_lost else ExitCode.CONVERGED
-
-
 WORDS = ("good", "fair", "uncertain")
 """Verdicts, best first."""
 REQUIRED = "fair"

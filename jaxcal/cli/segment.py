@@ -13,7 +13,6 @@ from jaxcal import InputError
 from jaxcal.cli.common import (
     POSITIVE,
     ExitCode,
-    import_code,
     import_engine,
     json_option,
     prepare_jax,
@@ -189,7 +188,7 @@ def _segment_frames(source: str, out: str | None, as_json: bool, options: dict[s
         count = f"{len(found.found)} of {len(found)} frames segmented ({found.target})"
         told = (f"{target}: {count}{hint}", *(f"- {note}" for note in notes))
         print_page(*told, *by_hand(source, found, options))
-    return import_code(most_lost)
+    return ExitCode.NOT_CONVERGED if most_lost else ExitCode.CONVERGED
 
 
 def _frames_record(
