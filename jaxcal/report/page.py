@@ -40,6 +40,7 @@ from jaxcal.report.verdict import (
     length_form,
     limits,
     scatter,
+    usable,
     verdict_word,
     where,
     why_larger,
@@ -105,20 +106,18 @@ def _is_page(path: str | os.PathLike[str]) -> bool:
 def page(record: dict[str, Any], result: Calibration, recording: Recording) -> str:
     """The page as text."""
     answer = result.numpy()
+    sections = [_head(record), _findings(record)]
     # With wrong frames there are no results to copy or to trust.
-    known = _usable(record)
-    sections = [
-        _head(record),
-        _findings(record),
-        *([_accuracy(record, answer, recording)] if known and record["tre"] is not None else []),
-        *([_matrix(record)] if known else []),
-        *([_scene(record, answer, recording)] if known else []),
-        *([_residuals(record, answer)] if known else []),
-        *([_limits(record)] if known and record["limits"] is not None else []),
-        *([_comparison(record)] if known else []),
-        _observability(record),
-        _facts(record),
-    ]
+    if usable(record):
+        sections += [
+            _accuracy(record, answer, recording),
+            _matrix(record),
+            _scene(record, answer, recording),
+            _residuals(record, answer),
+            _limits(record),
+            _comparison(record),
+        ]
+    sections += [_observability(record), _facts(record)]
     name = escape(Path(record["source"]).name)
     files = resources.files("jaxcal.report")
     style = (files / "page.css").read_text("utf-8")
@@ -133,10 +132,6 @@ def page(record: dict[str, Any], result: Calibration, recording: Recording) -> s
         + f"\n{_embedded('record', _shortened(record))}\n<script>\n{script}</script>\n"
         "</body></html>\n"
     )
-
-
-def _usable(record: dict[str, Any]) -> bool:
-    return record["status"] in ("converged", "max_iterations") and not record.get("wrong_frames")
 
 
 def _embedded(name: str, value: Any) -> str:
@@ -214,7 +209,7 @@ def _head(record: dict[str, Any]) -> str:
     tre = record["tre"]
     kind = escape(record["verdict"] or "uncertain")
     number = ""
-    if _usable(record) and tre is not None and tre.get("rms_mm") is not None:
+    if usable(record) and tre is not None and tre.get("rms_mm") is not None:
         number = (
             f'<div><span class="big">{_length(record, "tre.rms_mm", "mm")}</span>'
             "<small>error to expect at the image (TRE, root mean square)<br>95 % interval "
@@ -223,7 +218,7 @@ def _head(record: dict[str, Any]) -> str:
         )
     prior = "" if record["prior"] == "none" else f", prior {record['prior']}"
     said = [headline(record)]
-    if _usable(record):
+    if usable(record):
         said += [*why_larger(record), *where(record)]
         said += [*listed("What limits it", limits(record)), *scatter(record)]
     return (
@@ -266,6 +261,8 @@ def map_of_error(record: dict[str, Any], answer: Calibration, recording: Recordi
 
 def _accuracy(record: dict[str, Any], answer: Calibration, recording: Recording) -> str:
     tre, rows = record["tre"], []
+    if tre is None:
+        return ""
     for k, point in enumerate(tre["points"]):
         path = f"tre.points.{k}"
         u, v = (_number(record, f"{path}.image.{axis}", "z.1f") for axis in range(2))
@@ -495,8 +492,9 @@ def _residuals(record: dict[str, Any], answer: Calibration) -> str:
 
 
 def _limits(record: dict[str, Any]) -> str:
-    found = record["limits"]
-    rows = []
+    found, rows = record["limits"], []
+    if found is None:
+        return ""
     for title, name in (
         ("Mean square error of the calibration in the image", "error_share"),
         ("Mean square residual of the target", "scatter_share"),
@@ -504,18 +502,14 @@ def _limits(record: dict[str, Any]) -> str:
         shares = [(word, found[name][kind], colour) for kind, word, colour in _KINDS]
         if all(share is not None for _, share, _ in shares):
             rows.append((title, [(word, float(share), colour) for word, share, colour in shares]))
-    sds = " ".join(
-        f"{word} {_length(record, f'sigma_{name}_mm', 'mm')}{mark}"
-        for word, name, mark in (
-            ("lateral", "lateral", ","),
-            ("range", "range", ","),
-            ("out of the plane", "elevation", "."),
-        )
+    sds = ", ".join(
+        f"{word} {_length(record, f'sigma_{name}_mm', 'mm')}"
+        for (_, word, _), name in zip(_KINDS, ("lateral", "range", "elevation"), strict=True)
     )
     drawn = svg.stacked(rows, "Where the errors come from, in shares of mean squares")
     return _section(
         "Where the errors come from",
-        f"<figure>{drawn}</figure><p>Standard deviations found: {sds} Residual, root mean square: "
+        f"<figure>{drawn}</figure><p>Standard deviations found: {sds}. Residual, root mean square: "
         f"{_number(record, 'rms_mm', '.3f', 'mm')}, of which "
         f"{_number(record, 'limits.rms_in_plane_mm', '.3f', 'mm')} in the image plane and "
         f"{_number(record, 'limits.rms_elevational_mm', '.3f', 'mm')} out of it.</p>",
@@ -553,13 +547,13 @@ def _comparison(record: dict[str, Any]) -> str:
 def _observability(record: dict[str, Any]) -> str:
     sight = record["observability"]
     words = [f"Least well determined: {sight['weakest_direction']}."]
-    if _usable(record):
+    if usable(record):
         words += certainty(record)
     proved = certificate_words(record)
     if proved is not None:
         words.append(f"{proved[0].upper()}{proved[1:]}.")
     parts = [_paragraphs(words)]
-    if _usable(record) and record["image_covariance"] is not None:
+    if usable(record) and record["image_covariance"] is not None:
         covariance = np.array(record["image_covariance"], float)
         sd = np.sqrt(np.diagonal(covariance))
         names = record["image_unknowns"]
