@@ -138,22 +138,18 @@ class Store(Generic[S]):
             OutputError: the disk is full, the folder not writable.
         """
         start = chunk.condition * self.spec.trials
-        wanted = self.spec.arrays(chunk)
-        results = {name: results[name] for name in wanted}
+        units = {name: wanted.unit for name, wanted in self.spec.arrays(chunk).items()}
+        results = {name: results[name] for name in units}
         attributes = {
             "format": FORMAT,
             "version": VERSION,
             "spec_sha256": self.spec.sha256,
-            "chunk": chunk.index,
-            "condition": chunk.condition,
-            "trial_start": chunk.start,
-            "trial_stop": chunk.stop,
+            **_place(chunk),
             "index_start": start + chunk.start,
             "index_stop": start + chunk.stop,
             "checksum": _checksum(results),
             **maker,
         }
-        units = {name: array_spec.unit for name, array_spec in wanted.items()}
         # HDF5 notices a full disk only when it closes the file, and then loses the reason. A file
         # that is made in memory and written in one go reports it.
         write_bytes(self.path(chunk), _pack(results, attributes, units))
@@ -183,13 +179,7 @@ class Store(Generic[S]):
                 raise FormatError(f"is not a {FORMAT} of version {VERSION}")
             if text(root, "spec_sha256") != self.spec.sha256:
                 raise FormatError("belongs to another spec")
-            agreed = {
-                "chunk": chunk.index,
-                "condition": chunk.condition,
-                "trial_start": chunk.start,
-                "trial_stop": chunk.stop,
-            }
-            for name, value in agreed.items():
+            for name, value in _place(chunk).items():
                 if number(root, name) != value:
                     raise FormatError(f"its {name} is not {value}")
             checksum = text(root, "checksum")
@@ -242,6 +232,16 @@ def read_spec(folder: str | os.PathLike[str], kind: type[Any] = Spec) -> Any:
             f"{path}: is no {kind.__name__}: damaged, of another version of jaxcal, or a study of "
             "another class"
         ) from None
+
+
+def _place(chunk: Chunk) -> dict[str, int]:
+    """The attributes that say which trials a file has."""
+    return {
+        "chunk": chunk.index,
+        "condition": chunk.condition,
+        "trial_start": chunk.start,
+        "trial_stop": chunk.stop,
+    }
 
 
 def _pack(
