@@ -22,6 +22,7 @@ from jaxcal import InputError
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
+    from rich.table import Table
 
     from jaxcal.data.recording import Recording
 
@@ -162,6 +163,18 @@ def _only_processor() -> None:
 def print_json(record: dict[str, Any]) -> None:
     """One JSON object on one line of standard output."""
     click.echo(json.dumps(record, allow_nan=False))
+
+
+def simple_table(headings: Iterable[str], words: Iterable[str]) -> Table:
+    """A table without lines, in which the columns of ``words`` begin at the left, others do not."""
+    from rich import box
+    from rich.table import Table
+
+    table, left = Table(box=box.SIMPLE), set(words)
+    for heading in headings:
+        # Folded: a narrow terminal would cut off the ends of words, and paths would look alike.
+        table.add_column(heading, justify="left" if heading in left else "right", overflow="fold")
+    return table
 
 
 class Verbatim(str):
