@@ -28,7 +28,7 @@ import numpy as np
 
 from jaxcal import FormatError, InputError, MissingFileError
 from jaxcal.io.atomic import made_folder, write_bytes, write_text
-from jaxcal.io.given_files import check_readable, one_line, path_name
+from jaxcal.io.given_files import check_readable, naming, one_line, path_name
 from jaxcal.io.toml import MAXIMUM_BYTES
 from jaxcal.io.untrusted import array, child, number, open_root, text
 from jaxcal.study.interface import Chunk, Study
@@ -162,19 +162,7 @@ class Store(Generic[S]):
         """
         path = self.path(chunk)
         check_readable(path)
-        try:
-            return self._read(path, chunk)
-        except FormatError as error:
-            raise FormatError(f"{path}: {error}") from None
-
-    def versions(self, chunk: Chunk) -> str:
-        """What computed a chunk: versions and device, in words."""
-        with open_root(self.path(chunk)) as root:
-            parts = [text(root, name) or "?" for name in ("jaxcal", "jax", "device")]
-        return f"jaxcal {parts[0]}, jax {parts[1]}, {parts[2]}"
-
-    def _read(self, path: Path, chunk: Chunk) -> dict[str, np.ndarray]:
-        with open_root(path) as root:
+        with naming(path), open_root(path) as root:
             if text(root, "format") != FORMAT or number(root, "version") != VERSION:
                 raise FormatError(f"is not a {FORMAT} of version {VERSION}")
             if text(root, "spec_sha256") != self.spec.sha256:
@@ -182,16 +170,21 @@ class Store(Generic[S]):
             for name, value in _place(chunk).items():
                 if number(root, name) != value:
                     raise FormatError(f"its {name} is not {value}")
-            checksum = text(root, "checksum")
             results = {}
             for name, wanted in self.spec.arrays(chunk).items():
                 node = child(root, name)
                 if node is None:
                     raise FormatError(f"has no {name}")
                 results[name] = array(node, wanted.shape, wanted.kind)
-        if checksum != _checksum(results):
-            raise FormatError("is damaged: its checksum is wrong")
-        return results
+            if text(root, "checksum") != _checksum(results):
+                raise FormatError("is damaged: its checksum is wrong")
+            return results
+
+    def versions(self, chunk: Chunk) -> str:
+        """What computed a chunk: versions and device, in words."""
+        with open_root(self.path(chunk)) as root:
+            parts = [text(root, name) or "?" for name in ("jaxcal", "jax", "device")]
+        return f"jaxcal {parts[0]}, jax {parts[1]}, {parts[2]}"
 
     @property
     def _spec_path(self) -> Path:
