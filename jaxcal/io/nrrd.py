@@ -69,9 +69,6 @@ def read_nrrd(path: Path, name: str) -> TrackedSequence:
     pixels = None
     if columns > 1 and rows > 1:
         pixels = _nrrd_pixels(path, header, (columns, rows, channels), count)
-        # As Slicer documents its volume sequences; it may also list the frames along the last axis.
-        if fields.get("kinds", "").startswith("list"):
-            pixels = checked_pixels(replace(pixels, interleaved=True), count)
     found = sequence_of(header, count, pixels, "Status", name)
     if not np.isfinite(found.time).any() and (time := _index_times(fields, count)) is not None:
         return replace(found, time=time)
@@ -160,6 +157,8 @@ def _nrrd_pixels(
                 fields.get("ultrasound image orientation", ""),
                 fields.get("ultrasound image type", ""),
             ),
+            # As Slicer documents its volume sequences; it may also list frames along the last axis.
+            interleaved=fields.get("kinds", "").startswith("list"),
         ),
         count,
     )
