@@ -66,14 +66,6 @@ class CheckedFile(io.RawIOBase):
         self._seen: set[int] = set()
         self._bytes_left, self._objects_left = _MOST_BYTES, _MOST_OBJECTS
 
-    def readable(self) -> bool:
-        """Yes."""
-        return True
-
-    def seekable(self) -> bool:
-        """Yes."""
-        return True
-
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
         """As of any file."""
         origin = {os.SEEK_SET: 0, os.SEEK_CUR: self._place, os.SEEK_END: self._length}[whence]
