@@ -146,11 +146,7 @@ def _tre(
     cells = region.grid(_ACROSS, _ACROSS).reshape(_ACROSS, _ACROSS, 3)[..., [0, 2]]
     mapped = tre_at(answer, cells)
     return {
-        "region": {
-            "lateral_mm": region.lateral_mm,
-            "depth_mm": region.depth_mm,
-            "radius_mm": region.radius_mm,
-        },
+        "region": vars(region),
         "unit": "px" if pixels else "mm",
         "stated_mm": over.rms,
         "stated_interval_mm": [over.lower, over.upper],
