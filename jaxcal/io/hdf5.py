@@ -160,23 +160,19 @@ def raw_data(root: Node) -> str | None:
 
 def _read(source: str | os.PathLike[str] | io.BytesIO, name: str) -> Recording:
     with naming(name), open_root(source) as root:
-        return _read_root(root, name)
-
-
-def _read_root(root: Node, name: str) -> Recording:
-    _check_header(root)
-    probe = _read_probe(root)
-    selected = _read_images(root, "calibration", probe, MINIMUM_IMAGES)
-    if selected is None:
-        raise FormatError("has no /calibration: there are no images to calibrate with")
-    return Recording(
-        calibration=selected,
-        test=_read_images(root, "test", probe, minimum=1),
-        truth=_read_truth(root, len(selected)),
-        probe=probe,
-        source=name,
-        pose_frames=_read_frames(root),
-    )
+        _check_header(root)
+        probe = _read_probe(root)
+        selected = _read_images(root, "calibration", probe, MINIMUM_IMAGES)
+        if selected is None:
+            raise FormatError("has no /calibration: there are no images to calibrate with")
+        return Recording(
+            calibration=selected,
+            test=_read_images(root, "test", probe, minimum=1),
+            truth=_read_truth(root, len(selected)),
+            probe=probe,
+            source=name,
+            pose_frames=_read_frames(root),
+        )
 
 
 def _read_frames(root: Node) -> tuple[str, str] | None:
