@@ -271,17 +271,20 @@ class Spec:
         """
         try:
             content = json.loads(text)
-            given = content["axes"]
+            conditions = {
+                name: values if name in content["listed"] else values[0]
+                for name, values in content["axes"].items()
+            }
             spec = cls(
                 *_head(content),
-                tuple((name, tuple(given[name])) for name in AXES),
-                tuple(content["listed"]),
+                *_axes(conditions),
                 LinearProbe(**content["probe"]),
                 tuple(MethodSpec(**method) for method in content["methods"]),
             )
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            same = spec.canonical() == text
+        except (ValueError, LookupError, TypeError, AttributeError, OverflowError) as error:
             raise InputError(f"is not a study's canonical spec: {error}") from None
-        if spec.canonical() != text:
+        if not same:
             raise InputError("is not a study's canonical spec")
         _check_size(spec)
         return spec
