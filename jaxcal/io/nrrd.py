@@ -10,6 +10,7 @@ from urllib.parse import unquote
 import numpy as np
 
 from jaxcal import FormatError
+from jaxcal.io.columns import TIMES_S
 from jaxcal.io.pixel_stream import Packing
 from jaxcal.io.sequence import Pixels, TrackedSequence
 from jaxcal.io.sequence_header import (
@@ -25,7 +26,6 @@ from jaxcal.io.sequence_header import (
 from jaxcal.runtime.messages import quoted
 
 _AS_ONE = ": only pixels that follow the header are read (save both as one file, .nrrd)"
-_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 _NRRD_TYPES = {
     "u1": ("uchar", "unsigned char", "uint8", "uint8_t"),
     "i1": ("char", "signed char", "int8", "int8_t"),
@@ -86,7 +86,7 @@ def _index_times(fields: dict[str, str], count: int) -> np.ndarray | None:
     if values is None:
         return None
     unit, label = (_of_axis(fields.get(name, ""), axis) for name in ("units", "labels"))
-    factor = _SECONDS.get(unit)
+    factor = TIMES_S.get(unit)
     if factor is None and not (unit == "" and label.lower() == "time"):
         return None
     try:
