@@ -325,16 +325,13 @@ def _scene(record: dict[str, Any], answer: Calibration, recording: Recording) ->
     poses = recording.calibration.poses[shown]
     images, seen = poses @ x, targets_in_images(poses, x, point)
     # The measured point is in the plane, at the measured lateral position and range.
-    residual = np.asarray(answer.residual)[shown]
-    measured = seen - residual
-    cloud = np.asarray(reconstruct(x, recording.calibration.poses[shown], measured))
+    cloud = np.asarray(reconstruct(x, poses, seen - np.asarray(answer.residual)[shown]))
     wide = max(float(np.ptp(seen[:, 0])) / 2, 10.0)
     deep = float(seen[:, 2].max())
     middle = float(0.5 * (seen[:, 0].min() + seen[:, 0].max()))
     across, down = np.array([-1, 1, 1, -1, -1]), np.array([0, 0, 1, 1, 0])
     corners = np.stack([middle + wide * across, 0.0 * down, deep * down], axis=-1)
-    frames = images[:, None, :3, :3] @ corners[None, :, :, None]
-    frames = frames[..., 0] + images[:, None, :3, 3]
+    frames = corners @ np.swapaxes(images[:, :3, :3], 1, 2) + images[:, None, :3, 3]
     far = np.concatenate([frames.reshape(-1, 3), point[None]])
     centre = 0.5 * (far.min(axis=0) + far.max(axis=0))
     lines = [
@@ -355,31 +352,27 @@ def _scene(record: dict[str, Any], answer: Calibration, recording: Recording) ->
     }
     close = _close_up(answer, cloud, shown)
     ellipsoid = " with its 95 % ellipsoid (lines)" if close["lines"] else ""
-    views = (
-        (
-            whole,
-            "scene-all",
-            "Planes of the images (blue) and the target (orange), in the tracker's frame.",
-        ),
-        (
-            close,
-            "scene-target",
-            "The target's position by each image (green; orange: an image that does not fit the "
-            f"rest), and its estimate{ellipsoid}.",
-        ),
+    all_images = "Planes of the images (blue) and the target (orange), in the tracker's frame."
+    by_image = (
+        "The target's position by each image (green; orange: an image that does not fit the "
+        f"rest), and its estimate{ellipsoid}."
     )
-    parts = [
-        f'<figure>{_embedded(name, data)}<svg class="scene" viewBox="0 0 380 300" role="img" '
-        f'tabindex="0" aria-label="{escape(words)}" data-scene="{name}"></svg>'
-        f'<figcaption>{escape(words)} <span class="screen">Drag, or use the arrow keys, to turn.'
-        "</span></figcaption></figure>"
-        for data, name, words in views
-    ]
     place = ", ".join(_number(record, f"point_mm.{k}", ".3f") for k in range(3))
     return _section(
         "In space",
-        f'<div class="grid">{"".join(parts)}</div>',
+        f'<div class="grid">{_view("scene-all", whole, all_images)}'
+        f"{_view('scene-target', close, by_image)}</div>",
         f"<p>Target in the tracker's frame: {place}&nbsp;mm.</p>",
+    )
+
+
+def _view(name: str, scene: dict[str, Any], words: str) -> str:
+    """A figure that the page's script draws and turns."""
+    return (
+        f'<figure>{_embedded(name, scene)}<svg class="scene" viewBox="0 0 380 300" role="img" '
+        f'tabindex="0" aria-label="{escape(words)}" data-scene="{name}"></svg>'
+        f'<figcaption>{escape(words)} <span class="screen">Drag, or use the arrow keys, to turn.'
+        "</span></figcaption></figure>"
     )
 
 
@@ -395,11 +388,10 @@ def _close_up(
         # 7.81: 95 % point of chi squared with three degrees of freedom.
         axes = vectors * np.sqrt(7.81 * np.maximum(values, 0.0))
         reach = float(np.linalg.norm(axes, axis=0).max())
-        round_ = np.linspace(0, 2 * np.pi, 49)
-        for i, j in ((0, 1), (1, 2), (2, 0)):
-            ring = (
-                point + np.outer(np.cos(round_), axes[:, i]) + np.outer(np.sin(round_), axes[:, j])
-            )
+        turned = np.linspace(0, 2 * np.pi, 49)
+        circle = np.stack([np.cos(turned), np.sin(turned)], axis=-1)
+        for pair in ([0, 1], [1, 2], [2, 0]):
+            ring = point + circle @ axes[:, pair].T
             lines.append({"points": _rounded(ring), "colour": "var(--text)", "width": 0.8})
     away = np.linalg.norm(cloud - point, axis=1)
     # A few points that are far off must not shrink the others to a single dot.
