@@ -62,13 +62,10 @@ def compare(
             "none of these files says which part of the image was used: name points of the image "
             "by --pixel U V"
         )
+    named = zip(calibrations, transforms, strict=True)
     pairs = [
-        (
-            calibrations[a],
-            calibrations[b],
-            compare_calibrations(transforms[a], transforms[b], points),
-        )
-        for a, b in combinations(range(len(transforms)), 2)
+        (first, second, compare_calibrations(one, other, points))
+        for (first, one), (second, other) in combinations(named, 2)
     ]
     sources = [stated_source(name) for name in calibrations]
     shared = sorted({name for name in sources if name and sources.count(name) > 1})
