@@ -215,14 +215,12 @@ def scatter(record: dict[str, Any]) -> list[str]:
     of_calibration = record["reconstruction_precision_set"] == "calibration"
     tested = "" if of_calibration else f"{record['reconstruction_precision_images']} "
     counted = " (those left out included)" if left_out and of_calibration else ""
-    shown = (
-        ""
-        if precision is None
-        else (
+    shown = ""
+    if precision is not None:
+        shown = (
             f"; reconstruction precision (Eq. 8) over the {tested}"
             f"{record['reconstruction_precision_set']} images{counted}: {_mm(precision)}"
         )
-    )
     ranked = sorted(found["scatter_share"].items(), key=lambda item: -(item[1] or 0.0))
     told = [f"{100 * share:.0f} % {_KINDS[kind]}" for kind, share in ranked if share is not None]
     tre, within = record["tre"], record["rms_mm"] or 0.0
