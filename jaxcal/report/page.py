@@ -234,15 +234,12 @@ def _head(record: dict[str, Any]) -> str:
 
 def _findings(record: dict[str, Any]) -> str:
     """What looks wrong, from all checks, and what to do about it."""
-    found = [str(text) for text in [*record.get("findings", ()), *record["warnings"]]]
     parts = []
-    if found:
+    if found := record["warnings"]:
         parts += ["<h3>Look at this</h3>", _paragraphs([BULLET + text for text in found])]
-    todo = advice(record)
-    if todo:
+    if todo := advice(record):
         parts += ["<h3>What to do</h3>", _paragraphs([BULLET + text for text in todo])]
-    more = next_poses_sentences(record)
-    if more:
+    if more := next_poses_sentences(record):
         parts += ["<h3>Which images to add</h3>", _paragraphs(more)]
     return _section("What to look at, and what to do", *parts) if parts else ""
 
