@@ -196,12 +196,15 @@ def draw_program(shape: Protocol, devices: Devices) -> Any:
     """From (trial indices, seed, numbers) to :func:`jaxcal.study.trials.experiments`, compiled."""
 
     def program(indices: Array, seed: Array, numbers: dict[str, Any]) -> Any:
-        # The keys of trials by their numbers: draws depend on nothing else.
-        root = jax.random.key(seed)
-        keys = jax.vmap(lambda index: jax.random.fold_in(root, index))(indices)
-        return experiments(keys, join_protocol(shape, numbers))
+        return experiments(trial_keys(indices, seed), join_protocol(shape, numbers))
 
     return compile_pieces(program, devices, pieces=1)
+
+
+def trial_keys(indices: Array, seed: Array) -> Array:
+    """The keys of trials by their numbers: draws depend on nothing else."""
+    root = jax.random.key(seed)
+    return jax.vmap(lambda index: jax.random.fold_in(root, index))(indices)
 
 
 @cache
