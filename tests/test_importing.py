@@ -419,6 +419,11 @@ def test_points_of_a_sequence(tmp_path, sequence, name, text, points):
         ("p.mrk.json", "[" * 10**5, "is not JSON"),
         ("p.mrk.json", "{}", "holds no markups"),
         ("p.mrk.json", markups("XYZ", 1, ["F"] * 6), "neither LPS nor RAS"),
+        (
+            "p.mrk.json",
+            '{"markups": [{"controlPoints": [{"position": [%s, 1, 0]}]}]}' % ("9" * 400),
+            "point 1: a position is three finite numbers",
+        ),
         ("p.csv", "frame,u,v\n9,1,1\n", "frame 9 is not in the sequence"),
         ("p.csv", "frame,u,v\n1,1,1\n1,2,2\n", "frame 1 has more than one point"),
         ("p.csv", "frame,u,v\n1.5,1,1\n", "p.csv:2: column 1 is not the number of an image"),

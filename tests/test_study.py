@@ -3,6 +3,7 @@
 import dataclasses
 import fcntl
 import functools
+import json
 import os
 import re
 import signal
@@ -198,6 +199,17 @@ def test_what_says_the_same_has_the_same_hash():
         assert parse_spec(changed).sha256 != spec.sha256
     with pytest.raises(InputError):
         Spec.from_canonical(spec.canonical().replace('"seed": 11', '"seed": 11.0'))
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [("images", ["fifty"]), ("noise_mm", ["loud"]), ("images", []), ("depth_min_mm", [95.0])],
+)
+def test_the_values_of_a_stored_spec_are_checked(name, values):
+    content = json.loads(parse_spec(small()).canonical())
+    content["axes"][name] = values
+    with pytest.raises(InputError, match="canonical"):
+        Spec.from_canonical(json.dumps(content, sort_keys=True))
 
 
 def test_the_grid_is_counted_in_order():

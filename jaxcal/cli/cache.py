@@ -13,7 +13,15 @@ from typing import TYPE_CHECKING, Any, get_args
 import click
 
 from jaxcal import InputError, OutputError
-from jaxcal.cli.common import Commands, ExitCode, json_option, print_json, print_page, progress
+from jaxcal.cli.common import (
+    Commands,
+    ExitCode,
+    json_option,
+    print_json,
+    print_page,
+    progress,
+    simple_table,
+)
 from jaxcal.runtime import jax_cache, program_cache
 from jaxcal.runtime.messages import counted
 from jaxcal.solvers.names import Method
@@ -139,26 +147,15 @@ def clear() -> int:
 
 
 def _table(rows: list[dict[str, Any]]) -> Any:
-    from rich import box
-    from rich.table import Table
-
-    table = Table(box=box.SIMPLE)
-    for heading in ("method", "prior", "unknowns", "data"):
-        table.add_column(heading)
-    for heading in ("images", "size (MB)", "compiled in (s)", "last used"):
-        table.add_column(heading, justify="right")
+    names = ("method", "prior", "unknowns", "data")
+    table = simple_table((*names, "images", "size (MB)", "compiled in (s)", "last used"), names)
     for row in rows:
-        words = [str(row.get(name, "-")) for name in ("method", "prior", "unknowns", "data")]
+        words = [str(row.get(name, "-")) for name in names]
         if row["refused"]:
             words[0] = "refused"
         seconds = "-" if row["compile_s"] is None else f"{row['compile_s']:.1f}"
-        table.add_row(
-            *words,
-            str(row.get("images", "-")),
-            f"{row['bytes'] / 1e6:.1f}",
-            seconds,
-            _ago(row["used_s_ago"]),
-        )
+        images, size = str(row.get("images", "-")), f"{row['bytes'] / 1e6:.1f}"
+        table.add_row(*words, images, size, seconds, _ago(row["used_s_ago"]))
     return table
 
 

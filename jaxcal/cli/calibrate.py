@@ -180,9 +180,6 @@ def calibrate(
     sigma: tuple[float, float, float] | None,
     estimate: str | None,
     solver: SolverName | None,
-    tolerance_mm: float | None,
-    tolerance_rad: float | None,
-    max_rounds: int | None,
     data: Data,
     robust: bool,
     test: str | None,
@@ -195,6 +192,7 @@ def calibrate(
     report: str | None,
     out: str | None,
     as_json: bool,
+    **alternation: Any,
 ) -> int:
     """Calibrate from the recording REC. No starting guess is needed."""
     inputs = [recording] if test is None else [recording, test]
@@ -205,11 +203,6 @@ def calibrate(
     from jaxcal.model.unknowns import unknown_names
     from jaxcal.solvers.plan import Options
 
-    alternation = {
-        "tolerance_mm": tolerance_mm,
-        "tolerance_rad": tolerance_rad,
-        "max_rounds": max_rounds,
-    }
     chosen = {name: value for name, value in alternation.items() if value is not None}
     check_alternation(["--" + name.replace("_", "-") for name in chosen], method)
     options = Options(**chosen, solver=solver or "lm")
@@ -261,8 +254,7 @@ def calibrate(
         record = dated(record)
         if folder is not None:
             with progress("drawing the report"):
-                curves = _curves(measured, request, result)
-                write_report(folder, record, result, measured, curves)
+                write_report(folder, record, result, measured, _curves(measured, request, result))
     if report is not None:
         from jaxcal.report.page import write_page
 

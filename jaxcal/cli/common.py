@@ -22,6 +22,7 @@ from jaxcal import InputError
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
+    from rich.table import Table
 
     from jaxcal.data.recording import Recording
 
@@ -115,11 +116,6 @@ def exit_code(records: Iterable[dict[str, Any]]) -> ExitCode:
     return ExitCode.CONVERGED if converged else ExitCode.NOT_CONVERGED
 
 
-def import_code(most_lost: bool) -> ExitCode:
-    """3 where most frames, or points of another file, had to be left out."""
-    return ExitCode.NOT_CONVERGED if most_lost else ExitCode.CONVERGED
-
-
 WORDS = ("good", "fair", "uncertain")
 """Verdicts, best first."""
 REQUIRED = "fair"
@@ -167,6 +163,18 @@ def _only_processor() -> None:
 def print_json(record: dict[str, Any]) -> None:
     """One JSON object on one line of standard output."""
     click.echo(json.dumps(record, allow_nan=False))
+
+
+def simple_table(headings: Iterable[str], words: Iterable[str]) -> Table:
+    """A table without lines, in which the columns of ``words`` begin at the left, others do not."""
+    from rich import box
+    from rich.table import Table
+
+    table, left = Table(box=box.SIMPLE), set(words)
+    for heading in headings:
+        # Folded: a narrow terminal would cut off the ends of words, and paths would look alike.
+        table.add_column(heading, justify="left" if heading in left else "right", overflow="fold")
+    return table
 
 
 class Verbatim(str):

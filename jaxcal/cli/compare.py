@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from jaxcal.cli.common import ExitCode, json_option, print_json, print_page
+from jaxcal.cli.common import ExitCode, json_option, print_json, print_page, simple_table
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -62,13 +62,10 @@ def compare(
             "none of these files says which part of the image was used: name points of the image "
             "by --pixel U V"
         )
+    named = zip(calibrations, transforms, strict=True)
     pairs = [
-        (
-            calibrations[a],
-            calibrations[b],
-            compare_calibrations(transforms[a], transforms[b], points),
-        )
-        for a, b in combinations(range(len(transforms)), 2)
+        (first, second, compare_calibrations(one, other, points))
+        for (first, one), (second, other) in combinations(named, 2)
     ]
     sources = [stated_source(name) for name in calibrations]
     shared = sorted({name for name in sources if name and sources.count(name) > 1})
@@ -113,20 +110,8 @@ def _millimetres(value: float) -> str:
     return "-" if math.isnan(value) else f"{value:.2f}"
 
 
-def _table(*headings: str) -> Table:
-    from rich import box
-    from rich.table import Table
-
-    table = Table(box=box.SIMPLE)
-    for heading in headings:
-        # Folded: where a path is cut off, those of one folder look alike.
-        justify = "right" if "(" in heading else "left"
-        table.add_column(heading, justify=justify, overflow="fold")
-    return table
-
-
 def _table_of_points(found: Comparison, unit: str) -> Table:
-    table = _table(f"image point ({unit})", "apart (mm)", "expected, RMS (mm)")
+    table = simple_table((f"image point ({unit})", "apart (mm)", "expected, RMS (mm)"), ())
     for (u, v), apart, expected in zip(
         found.points, found.apart_mm, found.expected_mm, strict=True
     ):
@@ -136,9 +121,9 @@ def _table_of_points(found: Comparison, unit: str) -> Table:
 
 
 def _table_of_pairs(pairs: list[tuple[str, str, Comparison]]) -> Table:
-    table = _table(
-        "first", "second", "apart, RMS (mm)", "expected (mm)", "95 % below (mm)", "agree"
-    )
+    names = ("first", "second", "agree")
+    sizes = ("apart, RMS (mm)", "expected (mm)", "95 % below (mm)")
+    table = simple_table((*names[:2], *sizes, names[2]), names)
     words = {True: "yes", False: "no", None: "-"}
     for first, second, found in pairs:
         numbers = (found.rms_mm, found.expected_rms_mm, found.limit_mm)

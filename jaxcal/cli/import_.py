@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from jaxcal import InputError, OutputError
-from jaxcal.cli.common import import_code, progress
+from jaxcal.cli.common import ExitCode, progress
 from jaxcal.cli.sequence_options import SEARCH, TABLES, TRACKING, by_hand, with_options
 from jaxcal.io.atomic import check_writable
 from jaxcal.io.outputs import RECORDING, check_output, is_hdf5_recording, is_recording
@@ -89,7 +89,7 @@ def import_(sources: tuple[str, ...], out: str, add_to: str | None, **options: A
         click.echo(f"- {note}")
     for line in [] if frames is None else by_hand(sources[0], frames, options):
         click.echo(line)
-    return import_code(most_lost)
+    return ExitCode.NOT_CONVERGED if most_lost else ExitCode.CONVERGED
 
 
 def _check(sources: tuple[str, ...], out: str, add_to: str | None, options: dict[str, Any]) -> None:

@@ -22,6 +22,7 @@ from jaxcal.cli.common import (
     progress,
     seed_option,
     segmented,
+    simple_table,
 )
 from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
 from jaxcal.study.laws import OFFSET_LAWS, LawName
@@ -347,16 +348,10 @@ def _record(
 def _print(
     found: Plan, record: dict[str, Any], figure: str | None, until_tre: float | None
 ) -> None:
-    from rich import box
-    from rich.table import Table
-
-    table = Table(box=box.SIMPLE)
     pixels = "target_px" in record["poses"][0]
     where = "u, v\n(px)" if pixels else "lateral, depth\n(mm)"
-    for heading in ("", "how to hold the probe", where, "error then\n(mm)"):
-        # Folded: a narrow terminal would cut off the ends of words.
-        justify = "left" if "hold" in heading else "right"
-        table.add_column(heading, justify=justify, overflow="fold")
+    hold = "how to hold the probe"
+    table = simple_table(("", hold, where, "error then\n(mm)"), (hold,))
     for k, pose in enumerate(record["poses"]):
         lateral, depth = pose["target_px" if pixels else "target_mm"]
         sign = " (fills space)" if pose["fills_space"] else ""
@@ -375,18 +370,17 @@ def _print(
     (near, far), (left, right) = (record["region"][k] for k in ("depth_mm", "lateral_mm"))
     total = "" if not there else ", the existing ones included,"
     before = "" if not there else f" added to the {there} existing ones"
-    reached = there and until_tre is not None and found.tre_mm[0] <= until_tre
+    reached: list[str] = []
+    if there and until_tre is not None and found.tre_mm[0] <= until_tre:
+        now = f"({found.tre_mm[0]:.2g} mm)"
+        reached.append(f"The existing images reach {until_tre:g} mm already {now}.")
     these = "this image" if len(found) == 1 else f"these {len(found)} images"
     print_page(
         table,
         f"Target {near:.0f} to {far:.0f} mm deep, laterally from {left:.0f} to {right:.0f} mm.",
         "Tilts and turns from the middle orientation, with the marker to your right; left is where "
         "the lateral position is smallest. Take them in any order.",
-        *(
-            [f"The existing images reach {until_tre:g} mm already ({found.tre_mm[0]:.2g} mm)."]
-            if reached
-            else []
-        ),
+        *reached,
         f"Predicted with {these}{before}: error over the image "
         f"{found.tre_mm[-1]:.2g} mm, reconstruction precision {found.rp_mm[-1]:.2g} mm.",
         *([f"Images needed{total} for an error of {'; '.join(counts)}."] if counts else []),

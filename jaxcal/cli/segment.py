@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -13,7 +13,6 @@ from jaxcal import InputError
 from jaxcal.cli.common import (
     POSITIVE,
     ExitCode,
-    import_code,
     import_engine,
     json_option,
     prepare_jax,
@@ -86,17 +85,7 @@ if TYPE_CHECKING:
 @json_option
 @click.pass_context
 def segment(
-    context: click.Context,
-    recording: str,
-    method: Literal["least-squares", "shortest"],
-    robust: bool,
-    scale: Literal["frame", "pooled"],
-    interpolate: bool,
-    sound_speed: float | None,
-    temperature: float | None,
-    out: str | None,
-    as_json: bool,
-    **frames: Any,
+    context: click.Context, recording: str, out: str | None, as_json: bool, **frames: Any
 ) -> int:
     """Segment times of flight, or the frames of a sequence, into points with covariances.
 
@@ -110,8 +99,9 @@ def segment(
     plane; the size of the elevational offset by its times (without a sign) is written to the group
     segmentation.
     """
+    times = {name: frames.pop(name) for name in _TIMES}
     of_frames = _is_of_frames(recording)
-    others = _TIMES if of_frames else tuple(frames)
+    others = times if of_frames else frames
     for parameter in context.command.params:
         given = context.get_parameter_source(parameter.name or "")
         if parameter.name in others and given is click.core.ParameterSource.COMMANDLINE:
@@ -119,6 +109,7 @@ def segment(
             raise InputError(f"{recording}: {parameter.opts[0]} is an option for {kind}")
     if of_frames:
         return _segment_frames(recording, out, as_json, frames)
+    sound_speed, temperature = times.pop("sound_speed"), times.pop("temperature")
     if sound_speed is not None and temperature is not None:
         raise InputError("--sound-speed and --temperature exclude each other")
     import_engine()
@@ -135,9 +126,8 @@ def segment(
     check_writable(target)
     probe = _probe(data, sound_speed, temperature)
     prepare_jax()
-    options: dict[str, Any] = {"method": method, "robust": robust, "scale": scale}
     with progress("segmenting"), naming(recording):
-        segmented, found = segment_recording(data, probe, interpolate=interpolate, **options)
+        segmented, found = segment_recording(data, probe, **times)
     save(segmented, target, found)
     record = _record(found, target)
     if as_json:
@@ -189,7 +179,7 @@ def _segment_frames(source: str, out: str | None, as_json: bool, options: dict[s
         count = f"{len(found.found)} of {len(found)} frames segmented ({found.target})"
         told = (f"{target}: {count}{hint}", *(f"- {note}" for note in notes))
         print_page(*told, *by_hand(source, found, options))
-    return import_code(most_lost)
+    return ExitCode.NOT_CONVERGED if most_lost else ExitCode.CONVERGED
 
 
 def _frames_record(

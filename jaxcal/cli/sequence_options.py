@@ -155,14 +155,11 @@ def given_options(options: dict[str, Any], *, orientation: bool = False) -> list
     names = {"poses": "poses", "from": "source", "to": "target", "lag": "lag_s"}
     names |= {"orientation": "orientation"} if orientation else {}
     names |= {"pose-units": "pose_units", "quaternion": "quaternion"}
-    given = {name: options[key] for name, key in names.items() if options[key]}
-    # Nothing is estimated where points are yet to be placed.
-    stated = [
-        part
-        for name, value in given.items()
-        if value != "auto"
-        for part in (f"--{name}", f"{value}")
-    ]
+    stated: list[str] = []
+    for name, key in names.items():
+        # Nothing is estimated where points are yet to be placed.
+        if options[key] and options[key] != "auto":
+            stated += [f"--{name}", f"{options[key]}"]
     return stated + ["--skip-invalid"] * options["skip_invalid"]
 
 

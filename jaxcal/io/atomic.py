@@ -214,8 +214,12 @@ def _only_writer(folder: Path) -> Iterator[bool]:
         os.close(descriptor)
 
 
-def lock(descriptor: int) -> bool | None:
+def lock(descriptor: int, *, shared: bool = False) -> bool | None:
     """Lock an open file or folder until it is closed or the process ends.
+
+    Args:
+        descriptor: of the file or folder.
+        shared: as a reader, of whom there may be several.
 
     Returns:
         False where another process has locked it; None where the system or the file system has no
@@ -224,7 +228,7 @@ def lock(descriptor: int) -> bool | None:
     if fcntl is None:
         return None
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
     except OSError:

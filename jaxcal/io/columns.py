@@ -121,9 +121,9 @@ def columns_of_header(names: list[str], quaternion: QuaternionOrder | None) -> C
     quaternion_columns = _quaternion(roles, numbered, quaternion)
     rest = [index for index in rest if index not in (quaternion_columns or ())]
     translation = _complete(roles, ("x", "y", "z"), "x, y and z")
-    matrix, unknown = _matrix(rest, list(bases), translation)
-    if unknown:
-        raise _unknown(names, unknown[0])
+    matrix = _matrix(rest, list(bases), translation)
+    if rest and matrix is None:
+        raise _unknown(names, rest[0])
     if matrix is not None and translation is not None and len(rest) != 9:
         raise FormatError("the header names both a whole matrix and x, y, z")
     if (quaternion_columns is None) != (translation is None) and matrix is None:
@@ -201,10 +201,8 @@ def _quaternion(
 
 def _matrix(
     rest: list[int], bases: list[str], translation: tuple[int, ...] | None
-) -> tuple[tuple[int, ...] | None, list[int]]:
-    """Columns of a matrix row by row, and those that belong to no matrix."""
-    if not rest:
-        return None, []
+) -> tuple[int, ...] | None:
+    """Columns of a matrix row by row; None where these are not those of one."""
     cells = [_CELL.fullmatch(bases[index]) for index in rest]
     found = [cell for cell in cells if cell is not None]
     if len(found) == len(rest) and len(rest) in (9, 12, 16):
@@ -219,13 +217,13 @@ def _matrix(
         rows = 4 if len(where) == 16 else 3
         wanted = [(row, column) for row in range(rows) for column in range(4)]
         if set(where) == set(wanted):
-            return tuple(where[place] for place in wanted), []
+            return tuple(where[place] for place in wanted)
     numbers = [_NUMBERED.fullmatch(bases[index]) for index in rest]
     if all(numbers) and len(rest) in (12, 16):
         values = [int(number[2]) for number in numbers if number is not None]
         if values in (list(range(len(rest))), list(range(1, len(rest) + 1))):
-            return tuple(rest), []
-    return None, rest
+            return tuple(rest)
+    return None
 
 
 def _point(

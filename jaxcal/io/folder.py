@@ -89,19 +89,22 @@ def with_pose_table(images: TrackedSequence, table: PoseTable) -> tuple[TrackedS
         InputError: a row that belongs to no image, or two rows of the same image; one line with
             file and line.
     """
-    assert isinstance(images.pixels, FolderPixels)
     if table.poses is None:
         raise InputError(f"{table.name}: holds no poses")
     if table.points is not None:
         raise InputError(
             f"{table.name}: holds points as well as poses: import it by itself, without images"
         )
-    rows = _rows(images, table)
-    values, counts = np.unique(rows, return_counts=True)
-    if (counts > 1).any():
-        name = images.pixels.paths[int(values[counts > 1][0])].name
-        raise InputError(f"{table.name}: has two poses for {quoted(name)}")
-    count = len(images)
+    count, rows = len(images), rows_by_name(images, table)
+    if rows is None:
+        if len(table) != count:
+            raise InputError(
+                f"{table.name}: {len(table)} poses, but {images.source} has {count} images: name "
+                "the images in a column file or frame"
+            )
+        rows = np.arange(count)
+    if (twice := first_repeated(rows)) is not None:
+        raise InputError(f"{table.name}: has two poses for {images.frame_name(twice)}")
     poses, valid = np.full((count, 4, 4), np.nan), np.zeros(count, bool)
     poses[rows], valid[rows] = table.poses, True
     time = np.full(count, np.nan)
@@ -121,40 +124,35 @@ def with_pose_table(images: TrackedSequence, table: PoseTable) -> tuple[TrackedS
     ), notes
 
 
-def rows_by_file(images: TrackedSequence, table: PoseTable) -> Int[np.ndarray, " m"]:
-    """The image that each row of a table belongs to, by its column ``file``.
+def rows_by_name(sequence: TrackedSequence, table: PoseTable) -> Int[np.ndarray, " m"] | None:
+    """The frame that each row of a table belongs to, by its column ``file`` or ``frame``.
+
+    ``file`` is for the images of a folder. None for a table without such a column.
 
     Raises:
-        InputError: a name that no image has; one line with file and line.
+        InputError: a name or number that no frame has; one line with file and line.
     """
-    assert isinstance(images.pixels, FolderPixels)
-    assert table.file is not None
-    paths = images.pixels.paths
-    places = {path.stem: index for index, path in enumerate(paths)}
-    # A whole name counts before another's without its ending.
-    places |= {path.name: index for index, path in enumerate(paths)}
-    named = [re.split(r"[/\\]", text)[-1] for text in table.file]
-    unknown = [row for row, text in enumerate(named) if text not in places]
-    if unknown:
-        raise InputError(
-            f"{table.name}:{table.lines[unknown[0]]}: there is no image "
-            f"{quoted(named[unknown[0]])} in {images.source}"
-        )
-    return np.array([places[text] for text in named])
+    if table.file is not None and (files := sequence.files):
+        places = {Path(name).stem: index for index, name in enumerate(files)}
+        # A whole name counts before another's without its ending.
+        places |= {name: index for index, name in enumerate(files)}
+        named = [re.split(r"[/\\]", text)[-1] for text in table.file]
+        unknown = [row for row, text in enumerate(named) if text not in places]
+        if unknown:
+            raise InputError(
+                f"{table.name}:{table.lines[unknown[0]]}: there is no image "
+                f"{quoted(named[unknown[0]])} in {sequence.source}"
+            )
+        return np.array([places[text] for text in named])
+    if table.frame is None:
+        return None
+    return sequence.rows_of(table.frame, [f"{table.name}:{line}" for line in table.lines])
 
 
-def _rows(images: TrackedSequence, table: PoseTable) -> Int[np.ndarray, " m"]:
-    """The image that each row of the table belongs to."""
-    if table.file is not None:
-        return rows_by_file(images, table)
-    if table.frame is not None:
-        return images.rows_of(table.frame, [f"{table.name}:{line}" for line in table.lines])
-    if len(table) != len(images):
-        raise InputError(
-            f"{table.name}: {len(table)} poses, but {images.source} has {len(images)} images: name "
-            "the images in a column file or frame"
-        )
-    return np.arange(len(table))
+def first_repeated(rows: Int[np.ndarray, " m"]) -> int | None:
+    """The least number that is there more than once."""
+    values, counts = np.unique(rows, return_counts=True)
+    return next(iter(values[counts > 1].tolist()), None)
 
 
 def _natural(name: str) -> list[tuple[int, int | str]]:

@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.io.folder import rows_by_file
+from jaxcal.io.folder import first_repeated, rows_by_name
 from jaxcal.io.given_files import naming
 from jaxcal.io.poses_by_time import times_of_table
 from jaxcal.io.sequence import TrackedSequence
@@ -83,10 +83,8 @@ def points_of_table(
 def _distinct(
     rows: Int[np.ndarray, " m"], sequence: TrackedSequence, name: str
 ) -> Int[np.ndarray, " m"]:
-    values, counts = np.unique(rows, return_counts=True)
-    if (counts > 1).any():
-        twice = sequence.frame_name(int(values[counts > 1][0]))
-        raise InputError(f"{name}: {twice} has more than one point")
+    if (twice := first_repeated(rows)) is not None:
+        raise InputError(f"{name}: {sequence.frame_name(twice)} has more than one point")
     return rows
 
 
@@ -121,10 +119,8 @@ def _rows_of_markups(
 def _rows_of_table(
     table: PoseTable, sequence: TrackedSequence, assignment: Assignment | None
 ) -> Int[np.ndarray, " m"]:
-    if table.file is not None and sequence.files:
-        return rows_by_file(sequence, table)
-    if table.frame is not None:
-        return sequence.rows_of(table.frame, [f"{table.name}:{line}" for line in table.lines])
+    if (rows := rows_by_name(sequence, table)) is not None:
+        return rows
     if assignment == "order":
         return _in_order(len(table), sequence)
     if table.time is not None:

@@ -86,6 +86,7 @@ _SPELLINGS = {
 _FREE = "1"
 _PER_IMAGE = {"amplitude": _FREE, "time": "s", "max_elevation": "mm", "frame": _FREE}
 """Optional numbers, one an image, and their units."""
+_KINDS: tuple[Kind, ...] = ("point", "pixel", "time_of_flight")
 _POSE_FRAMES = ("pose_from", "pose_to")
 
 
@@ -159,30 +160,25 @@ def raw_data(root: Node) -> str | None:
 
 def _read(source: str | os.PathLike[str] | io.BytesIO, name: str) -> Recording:
     with naming(name), open_root(source) as root:
-        return _read_root(root, name)
-
-
-def _read_root(root: Node, name: str) -> Recording:
-    _check_header(root)
-    probe = _read_probe(root)
-    selected = _read_images(root, "calibration", probe, MINIMUM_IMAGES)
-    if selected is None:
-        raise FormatError("has no /calibration: there are no images to calibrate with")
-    return Recording(
-        calibration=selected,
-        test=_read_images(root, "test", probe, minimum=1),
-        truth=_read_truth(root, len(selected)),
-        probe=probe,
-        source=name,
-        pose_frames=_read_frames(root),
-    )
+        _check_header(root)
+        probe = _read_probe(root)
+        selected = _read_images(root, "calibration", probe, MINIMUM_IMAGES)
+        if selected is None:
+            raise FormatError("has no /calibration: there are no images to calibrate with")
+        return Recording(
+            calibration=selected,
+            test=_read_images(root, "test", probe, minimum=1),
+            truth=_read_truth(root, len(selected)),
+            probe=probe,
+            source=name,
+            pose_frames=_read_frames(root),
+        )
 
 
 def _read_frames(root: Node) -> tuple[str, str] | None:
     """The names of the calibration poses' frames."""
     images = group(root, "calibration")
-    found = [None if images is None else text(images, name) for name in _POSE_FRAMES]
-    source, target = found
+    source, target = (None if images is None else text(images, name) for name in _POSE_FRAMES)
     return None if source is None or target is None else (source, target)
 
 
@@ -222,8 +218,7 @@ def _read_probe(root: Node) -> Probe | None:
     if not elements.is_integer():
         raise FormatError(f"/probe: attribute elements must be a whole number, not {elements:g}")
     pitch, sound_speed = _needed(node, "pitch_mm"), _needed(node, "sound_speed_m_s")
-    delay = number(node, "delay_s")
-    delay = 0.0 if delay is None else delay
+    delay = number(node, "delay_s") or 0.0
     try:
         if kind == "curvilinear":
             radius = _needed(node, "radius_mm")
@@ -277,10 +272,7 @@ def _area(kind: Kind) -> str:
 
 
 def _kind(node: Node) -> Kind:
-    found: list[Kind] = []
-    for kind in ("point", "pixel", "time_of_flight"):
-        if child(node, kind) is not None:
-            found.append(kind)
+    found: list[Kind] = [kind for kind in _KINDS if child(node, kind) is not None]
     if found == ["point", "time_of_flight"]:
         return "point"
     if len(found) != 1:
@@ -294,15 +286,16 @@ def _read_scale(node: Node, kind: Kind) -> tuple[np.ndarray | None, float, np.nd
     if kind == "time_of_flight":
         return None, 0.0, None
     owners = [owner for owner in (child(node, kind), node) if owner is not None]
-    pixels = owners if kind == "pixel" else []
-    spacings = [numbers(owner, "spacing_mm", 2) for owner in pixels]
-    offsets = [number(owner, "face_offset_mm") for owner in owners]
-    sizes = [numbers(owner, "frame_size", 2) for owner in pixels]
-    return (
-        next((value for value in spacings if value is not None), None),
-        next((value for value in offsets if value is not None), 0.0),
-        next((value for value in sizes if value is not None), None),
-    )
+
+    def stated(name: str, count: int) -> np.ndarray | None:
+        values = [numbers(owner, name, count) for owner in owners]
+        return next((value for value in values if value is not None), None)
+
+    offset = stated("face_offset_mm", 1)
+    face = 0.0 if offset is None else float(offset[0])
+    if kind == "point":
+        return None, face, None
+    return stated("spacing_mm", 2), face, stated("frame_size", 2)
 
 
 def _read_truth(root: Node, count: int) -> Truth | None:

@@ -22,6 +22,7 @@ import struct
 from typing import Any
 
 from jaxcal import FormatError
+from jaxcal.io.atomic import lock
 
 _LARGEST_HEAP = 2**26
 _MOST_BYTES = 2**28
@@ -54,25 +55,16 @@ class CheckedFile(io.RawIOBase):
         self.damage: FormatError | None = None
         self._ours = isinstance(source, str | os.PathLike)
         self._file: Any = io.FileIO(source) if self._ours else source  # pyright: ignore
-        if self._ours:
-            try:
-                _lock(self._file.fileno())
-            except BlockingIOError:
-                self._file.close()
-                raise
+        # HDF5 takes the same lock itself when it reads a file by its path.
+        wanted = os.environ.get("HDF5_USE_FILE_LOCKING", "").upper() not in ("FALSE", "0")
+        if self._ours and wanted and lock(self._file.fileno(), shared=True) is False:
+            self._file.close()
+            raise BlockingIOError
         found = self._file.seek(0, os.SEEK_END)
         self._length = found if length is None else max(found, length)
         self._place = 0
         self._seen: set[int] = set()
         self._bytes_left, self._objects_left = _MOST_BYTES, _MOST_OBJECTS
-
-    def readable(self) -> bool:
-        """Yes."""
-        return True
-
-    def seekable(self) -> bool:
-        """Yes."""
-        return True
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
         """As of any file."""
@@ -155,20 +147,3 @@ class CheckedFile(io.RawIOBase):
         self._objects_left -= objects
         if self._bytes_left < 0 or self._objects_left < 0:
             raise FormatError("is damaged: too many heaps of text")
-
-
-def _lock(descriptor: int) -> None:
-    """Take the lock that HDF5 takes itself when it reads a file by its path."""
-    if os.environ.get("HDF5_USE_FILE_LOCKING", "").upper() in ("FALSE", "0"):
-        return
-    try:
-        import fcntl
-    except ImportError:  # Windows
-        return
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        raise
-    except OSError:
-        # A file system without locks.
-        return

@@ -167,7 +167,9 @@ def _from_sequence(
         where = sequence.source
         if placed is None or points is None:
             results = (
-                _search(sequence, valid, options) if results is None else results.of_tracked(valid)
+                search_target(sequence, valid, options)
+                if results is None
+                else results.of_tracked(valid)
             )
             used = _found_points(sequence, results, options.minimum)
             given, what = len(sequence), "frames"
@@ -217,7 +219,7 @@ def _estimated_lag(
     """The lag and a note, and the target in all frames if it had to be looked for."""
     results = None
     if placed is None:
-        results = _search(sequence, np.ones(len(sequence), bool), options)
+        results = search_target(sequence, np.ones(len(sequence), bool), options)
         rows, points = results.found, results.position[results.found]
     else:
         shown = _shown(sequence, placed.rows)
@@ -305,18 +307,6 @@ def _spacing(
             "(--spacing states it)"
         )
     return stated.spacing_mm
-
-
-def _search(
-    sequence: TrackedSequence, tracked: Bool[np.ndarray, " n"], options: ImportOptions
-) -> FrameResults:
-    return search_target(
-        sequence,
-        tracked,
-        options.target_kind or "echo",
-        region=options.region,
-        orientation=options.orientation,
-    )
 
 
 def _found_points(sequence: TrackedSequence, results: FrameResults, minimum: int) -> FramePoints:

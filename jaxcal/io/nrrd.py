@@ -10,6 +10,7 @@ from urllib.parse import unquote
 import numpy as np
 
 from jaxcal import FormatError
+from jaxcal.io.columns import TIMES_S
 from jaxcal.io.pixel_stream import Packing
 from jaxcal.io.sequence import Pixels, TrackedSequence
 from jaxcal.io.sequence_header import (
@@ -25,7 +26,6 @@ from jaxcal.io.sequence_header import (
 from jaxcal.runtime.messages import quoted
 
 _AS_ONE = ": only pixels that follow the header are read (save both as one file, .nrrd)"
-_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 _NRRD_TYPES = {
     "u1": ("uchar", "unsigned char", "uint8", "uint8_t"),
     "i1": ("char", "signed char", "int8", "int8_t"),
@@ -69,9 +69,6 @@ def read_nrrd(path: Path, name: str) -> TrackedSequence:
     pixels = None
     if columns > 1 and rows > 1:
         pixels = _nrrd_pixels(path, header, (columns, rows, channels), count)
-        # As Slicer documents its volume sequences; it may also list the frames along the last axis.
-        if fields.get("kinds", "").startswith("list"):
-            pixels = checked_pixels(replace(pixels, interleaved=True), count)
     found = sequence_of(header, count, pixels, "Status", name)
     if not np.isfinite(found.time).any() and (time := _index_times(fields, count)) is not None:
         return replace(found, time=time)
@@ -89,7 +86,7 @@ def _index_times(fields: dict[str, str], count: int) -> np.ndarray | None:
     if values is None:
         return None
     unit, label = (_of_axis(fields.get(name, ""), axis) for name in ("units", "labels"))
-    factor = _SECONDS.get(unit)
+    factor = TIMES_S.get(unit)
     if factor is None and not (unit == "" and label.lower() == "time"):
         return None
     try:
@@ -160,6 +157,8 @@ def _nrrd_pixels(
                 fields.get("ultrasound image orientation", ""),
                 fields.get("ultrasound image type", ""),
             ),
+            # As Slicer documents its volume sequences; it may also list frames along the last axis.
+            interleaved=fields.get("kinds", "").startswith("list"),
         ),
         count,
     )

@@ -40,23 +40,17 @@ class PixelStream:
             self._file.seek(start)
         except OSError as error:
             raise FormatError(f"the pixels cannot be read: {one_line(error)}") from None
-        most, packed = stored, ""
-        if packing != "raw":
-            most, packed = stored * _MOST_INFLATION, f", compressed ({packing})"
-        if size > most:
-            self._file.close()
-            raise FormatError(
-                f"claims {size} bytes of pixels, the file holds {max(stored, 0)}{packed}"
-            )
-        if packing == "raw" and size < stored:
-            self._file.close()
-            raise FormatError(
-                f"claims {size} bytes of pixels, the file holds {stored}: correct the header's "
-                "size or type, or say there where the pixels begin"
-            )
-        self._inflate = None
+        self._inflate, most, how = None, stored, ""
         if packing != "raw":
             self._inflate = zlib.decompressobj(zlib.MAX_WBITS + (16 if packing == "gzip" else 0))
+            most, how = stored * _MOST_INFLATION, f", compressed ({packing})"
+        elif size < stored:
+            how = ": correct the header's size or type, or say there where the pixels begin"
+        if size > most or (packing == "raw" and size < stored):
+            self._file.close()
+            raise FormatError(
+                f"claims {size} bytes of pixels, the file holds {max(stored, 0)}{how}"
+            )
         self._position = 0
 
     def __enter__(self) -> PixelStream:

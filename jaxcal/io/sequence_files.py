@@ -70,29 +70,26 @@ def write_sequence(
     if not name.lower().endswith((".mha", ".mhd", ".nrrd")):
         raise InputError(f"{name}: a sequence's name ends in .mha, .mhd or .nrrd")
     time = np.asarray(time, dtype=np.float64)
-    count = len(time)
     check_written(transforms, time)
-    stack = stacked(images, count)
+    stack = stacked(images, len(time))
     nrrd = name.lower().endswith(".nrrd")
     status = None if images is None else "Status" if nrrd else "ImageStatus"
-    fields = [frame_fields(index, transforms, valid, time, status) for index in range(count)]
+    packed = packed_pixels(stack, "raw" if not compressed else "gzip" if nrrd else "zlib")
+    equals, last, beside = (":=" if nrrd else " = "), "", None
     if nrrd:
         head = nrrd_header(stack, orientation, compressed)
-        lines = [f"{key}:={value}" for of_frame in fields for key, value in of_frame]
-        packed = packed_pixels(stack, "gzip" if compressed else "raw")
-        write_bytes(path, "\n".join([*head, *lines, "", ""]).encode() + packed)
-        return
-    packed = packed_pixels(stack, "zlib" if compressed else "raw")
-    head = metaimage_header(stack, orientation, images is not None, compressed, len(packed))
-    lines = [f"{key} = {value}" for of_frame in fields for key, value in of_frame]
-    if name.lower().endswith(".mha"):
-        write_bytes(
-            path, "\n".join([*head, *lines, "ElementDataFile = LOCAL", ""]).encode() + packed
-        )
-        return
-    data = Path(name).with_suffix(".zraw" if compressed else ".raw")
-    with naming(path):
-        check_data_name(data.name)
-    # The pixels first: a header without them would be half a recording.
-    write_bytes(data, packed)
-    write_bytes(path, "\n".join([*head, *lines, f"ElementDataFile = {data.name}", ""]).encode())
+    else:
+        head = metaimage_header(stack, orientation, images is not None, compressed, len(packed))
+        last = "ElementDataFile = LOCAL"
+    lines = [
+        f"{key}{equals}{value}" for key, value in frame_fields(transforms, valid, time, status)
+    ]
+    if name.lower().endswith(".mhd"):
+        beside = Path(name).with_suffix(".zraw" if compressed else ".raw")
+        last = f"ElementDataFile = {beside.name}"
+        with naming(path):
+            check_data_name(beside.name)
+        # The pixels first: a header without them would be half a recording.
+        write_bytes(beside, packed)
+    header = "\n".join([*head, *lines, last, ""]).encode()
+    write_bytes(path, header if beside else header + packed)

@@ -243,28 +243,26 @@ def packed_pixels(stack: np.ndarray, packing: Packing) -> bytes:
 
 
 def frame_fields(
-    index: int,
     transforms: Mapping[FramePair, np.ndarray],
     valid: Mapping[FramePair, np.ndarray] | None,
     time: np.ndarray,
     image_status: str | None,
-) -> list[tuple[str, str]]:
-    """Keys and values of one frame; the image's status, where it has one, under this name."""
-    start = f"Seq_Frame{index:04d}_"
-    fields: list[tuple[str, str]] = []
-    for pair, matrices in transforms.items():
-        good = valid is None or pair not in valid or bool(valid[pair][index])
-        matrix = np.asarray(matrices[index], dtype=np.float64)
-        if good and not np.isfinite(matrix).all():
-            raise InputError(f"{'To'.join(pair)} of frame {index} holds NaN or Inf")
-        numbers = matrix if np.isfinite(matrix).all() else np.eye(4)
-        key = f"{start}{'To'.join(pair)}Transform"
-        fields.append((key, " ".join(map(repr, numbers.ravel().tolist()))))
-        fields.append((f"{key}Status", "OK" if good else "INVALID"))
-    fields.append((f"{start}Timestamp", repr(float(time[index]))))
-    if image_status is not None:
-        fields.append((f"{start}{image_status}", "OK"))
-    return fields
+) -> Iterator[tuple[str, str]]:
+    """Keys and values of all frames; the status of images, where they have one, under this name."""
+    for index in range(len(time)):
+        start = f"Seq_Frame{index:04d}_"
+        for pair, matrices in transforms.items():
+            good = valid is None or pair not in valid or bool(valid[pair][index])
+            matrix = np.asarray(matrices[index], dtype=np.float64)
+            if good and not np.isfinite(matrix).all():
+                raise InputError(f"{'To'.join(pair)} of frame {index} holds NaN or Inf")
+            numbers = matrix if np.isfinite(matrix).all() else np.eye(4)
+            key = f"{start}{'To'.join(pair)}Transform"
+            yield key, " ".join(map(repr, numbers.ravel().tolist()))
+            yield f"{key}Status", "OK" if good else "INVALID"
+        yield f"{start}Timestamp", repr(float(time[index]))
+        if image_status is not None:
+            yield f"{start}{image_status}", "OK"
 
 
 def written_orientation(orientation: str) -> str:

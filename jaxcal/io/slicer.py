@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import csv
 import json
-import math
 import os
+import sys
 from dataclasses import dataclass
 from typing import Any
 
@@ -132,10 +132,12 @@ def _signs(system: object) -> Float[np.ndarray, " 3"]:
 
 def _three(value: object, what: str) -> Float[np.ndarray, " 3"]:
     numbers = value if isinstance(value, list) else []
-    real = [float(part) for part in numbers if isinstance(part, int | float)]
-    if len(numbers) != 3 or len(real) != 3 or not all(map(math.isfinite, real)):
+    real = [part for part in numbers if isinstance(part, int | float)]
+    # A whole number of JSON may have more digits than a float can hold.
+    finite = all(abs(part) <= sys.float_info.max for part in real)
+    if len(numbers) != 3 or len(real) != 3 or not finite:
         raise FormatError(f"{what}: a position is three finite numbers")
-    return np.array(real)
+    return np.array(real, dtype=np.float64)
 
 
 def pixels_from_markups(markups: Markups) -> Float[np.ndarray, "n 2"]:

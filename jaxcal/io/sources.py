@@ -68,26 +68,16 @@ class ImportOptions:
     minimum: int = MINIMUM_IMAGES
 
 
-_FLAGS = {
-    "source": "--from",
-    "target": "--to",
-    "units": "--units",
-    "quaternion": "--quaternion",
-    "skip_invalid": "--skip-invalid",
-    "points": "--points",
-    "target_kind": "--target",
-    "region": "--region",
-    "orientation": "--orientation",
-    "ignore_time": "--ignore-time",
-    "lag_s": "--lag",
-}
+_FLAGS = {"source": "--from", "target": "--to", "target_kind": "--target", "lag_s": "--lag"}
+"""Options of the command line that have other names than those here."""
 
 
 def refuse(options: ImportOptions, names: Sequence[str], why: str) -> None:
     """Refuse options that were given and would not be used."""
     for name in names:
         if getattr(options, name) != getattr(ImportOptions, name):
-            raise InputError(f"{_FLAGS[name]} {why}")
+            flag = _FLAGS.get(name, f"--{name.replace('_', '-')}")
+            raise InputError(f"{flag} {why}")
 
 
 SEQUENCES = ("sequence", "tracker", "scan", "folder")

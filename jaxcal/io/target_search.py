@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,6 +19,9 @@ from jaxcal.io.given_files import naming
 from jaxcal.io.sequence import TrackedSequence
 from jaxcal.runtime.array_types import Bool, Float, Int
 from jaxcal.runtime.messages import command_line
+
+if TYPE_CHECKING:
+    from jaxcal.io.sources import ImportOptions
 
 FATES = ("found", "not credible", "not tracked", "image not OK")
 FOUND, NOT_CREDIBLE, NOT_TRACKED, IMAGE_NOT_OK = range(4)
@@ -79,14 +82,9 @@ class FrameResults:
 def search_target(
     sequence: TrackedSequence,
     tracked: Bool[np.ndarray, " n"],
-    target: Literal["echo", "cross"],
-    *,
-    region: tuple[int, int, int, int] | None = None,
-    orientation: str | None = None,
+    options: ImportOptions,
 ) -> FrameResults:
     """Look for the target in every frame that was tracked.
-
-    The options are those of :class:`jaxcal.io.sources.ImportOptions`.
 
     Raises:
         FormatError: pixels that cannot be read.
@@ -99,7 +97,7 @@ def search_target(
             f"{sequence.source}: holds no pixels: import it with a file of the target's points "
             f"({command_line(['jaxcal', 'import', sequence.source, 'POINTS.csv', 'OUT.h5'])})"
         )
-    count = len(sequence)
+    count, target = len(sequence), options.target_kind or "echo"
     fate = np.where(
         tracked, np.where(sequence.image_valid, NOT_CREDIBLE, IMAGE_NOT_OK), NOT_TRACKED
     )
@@ -107,10 +105,10 @@ def search_target(
     position, covariance = np.full((count, 2), np.nan), np.full((count, 2, 2), np.nan)
     contrast, margin = np.full(count, np.nan), np.full(count, np.nan)
     rows = np.flatnonzero(fate == NOT_CREDIBLE)
-    search: dict[str, Any] = {"region": region}
-    for row, frame in zip(rows, sequence.images(rows, orientation=orientation), strict=True):
+    frames = sequence.images(rows, orientation=options.orientation)
+    for row, frame in zip(rows, frames, strict=True):
         with naming(f"{sequence.source}: {sequence.frame_name(int(row))}"):
-            located = localise(frame, target, **search)
+            located = localise(frame, target, region=options.region)
         contrast[row], margin[row] = located.contrast_db[0], located.margin_db[0]
         reason[row] = located.reason[0]
         if located.found[0]:

@@ -19,7 +19,7 @@ import numpy as np
 
 from jaxcal import FormatError
 from jaxcal.data.poses import rotations_from_quaternions
-from jaxcal.io.columns import LENGTHS_MM, LengthUnit
+from jaxcal.io.columns import LengthUnit
 from jaxcal.io.frame_names import FramePair
 from jaxcal.io.given_files import naming
 from jaxcal.io.lines import text_lines
@@ -33,7 +33,8 @@ MOST_POSES = 1_000_000
 """Of all tools in all rows."""
 _ABSENT = -1e20
 """A number below this is missing: NDI writes -3.697314E28 in its place."""
-_METRES = {"meters": 1e3, "centimeters": 10.0, "millimeters": 1.0}
+_UNITS: dict[str, LengthUnit] = {"meters": "m", "centimeters": "cm", "millimeters": "mm"}
+"""What Motive calls them."""
 
 
 def is_tracker_export(path: str | os.PathLike[str]) -> bool:
@@ -88,17 +89,11 @@ Rows = Iterator[tuple[int, list[str]]]
 
 
 def _read_rows(
-    rows: Rows,
-    tools: dict[str, _Tool],
-    stamp: int | None,
-    counters: list[int],
-    factor: float,
-    name: str,
+    rows: Rows, tools: dict[str, _Tool], stamp: int | None, counters: list[int], name: str
 ) -> TrackedSequence:
-    """The poses of all tools, with times from the column ``stamp``.
+    """The poses of all tools, in the file's unit, with times from the column ``stamp``.
 
-    ``counters`` are the columns of the frame's number where no tool that was seen has its own;
-    ``factor`` is the unit of translations, mm.
+    ``counters`` are the columns of the frame's number where no tool that was seen has its own.
     """
     poses: dict[str, list[list[float]]] = {tool: [] for tool in tools}
     time: list[float] = []
@@ -134,7 +129,7 @@ def _read_rows(
         values[~good, :4] = 0.0, 0.0, 0.0, 1.0
         rotations = rotations_from_quaternions(values[:, :4], "xyzw", labels=labels)
         matrices[good, :3, :3] = rotations[good]
-        matrices[good, :3, 3] = factor * values[good, 4:]
+        matrices[good, :3, 3] = values[good, 4:]
         transforms[tool, TRACKER], valid[tool, TRACKER] = matrices, good
     no_images = np.zeros(len(time), bool)
     return TrackedSequence(
@@ -194,7 +189,7 @@ def _read_ndi(line: int, header: list[str], rows: Rows, name: str) -> TrackedSeq
     stamps = [index for index, cell in enumerate(header) if cell == "Time [sec]"]
     stamp = first.get("Time [sec]", next(iter(stamps), None))
     counters = [tool.counter for tool in tools.values() if tool.counter is not None]
-    return _read_rows(rows, tools, stamp, counters, 1.0, name)
+    return _read_rows(rows, tools, stamp, counters, name)
 
 
 def _tool_name(cell: str, taken: set[str]) -> str:
@@ -217,9 +212,9 @@ def _read_motive(
             f"rotations are exported as {quoted(rotation)}: export quaternions from Motive"
         )
     unit = stated.get("Length Units", "").lower()
-    if unit not in _METRES:
+    if unit not in _UNITS:
         raise FormatError(f"Length Units {quoted(unit)} are not known")
-    if pose_units is not None and LENGTHS_MM[pose_units] != _METRES[unit]:
+    if pose_units not in (None, _UNITS[unit]):
         raise FormatError(f"its Length Units are {unit}, not {pose_units}: leave --pose-units out")
     names: list[str] = []
     types: list[str] = []
@@ -236,7 +231,7 @@ def _read_motive(
             stamps = [index for index, cell in enumerate(cells) if cell.startswith("Time (")]
             counters = [index for index, cell in enumerate(cells) if cell == "Frame"]
             stamp = next(iter(stamps), None)
-            return _read_rows(rows, tools, stamp, counters, _METRES[unit], name)
+            return _read_rows(rows, tools, stamp, counters, name).scaled(_UNITS[unit])
         elif "Rotation" in cells or "Position" in cells:
             what = cells
     raise FormatError("has no row that begins with Frame: not a whole export of Motive")

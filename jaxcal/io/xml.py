@@ -9,6 +9,7 @@ a hundred lines.)
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from xml.parsers import expat
@@ -20,6 +21,8 @@ from jaxcal.runtime.messages import quoted
 MAXIMUM_BYTES = 8 * 2**20
 """Largest file that is read; a configuration of PLUS has some 10 kB, a result of fCal 1 MB."""
 
+_TAG = re.compile(rb"""(?:[^>"']|"[^"]*"|'[^']*')*+>""")
+"""A tag to its end; ``>`` may stand in quotes."""
 _MOST_ELEMENTS = 200_000
 _MOST_DEEP = 64
 
@@ -117,29 +120,20 @@ class _Builder:
 
     def finish(self, tag: str) -> None:
         element = self._open.pop()
-        after = _after_tag(self._content, element.start)
+        after = self._after_tag(element.start)
         if self._content[after - 2 : after] == b"/>":
             element.end = element.content_end = after
             return
         element.content_end = self._parser.CurrentByteIndex
-        element.end = _after_tag(self._content, element.content_end)
+        element.end = self._after_tag(element.content_end)
+
+    def _after_tag(self, start: int) -> int:
+        """The byte after the tag that begins at ``start``."""
+        found = _TAG.match(self._content, start)
+        return len(self._content) if found is None else found.end()
 
     def refuse(self, name: str, *_: object) -> None:
         raise FormatError(
             f"line {self._parser.CurrentLineNumber}: declares {quoted(str(name))}: document types "
             "and entities are not read"
         )
-
-
-def _after_tag(content: bytes, start: int) -> int:
-    """The byte after the tag that begins at ``start``; ``>`` may stand in quotes."""
-    quote = 0
-    for index in range(start, len(content)):
-        byte = content[index]
-        if quote:
-            quote = 0 if byte == quote else quote
-        elif byte in b"\"'":
-            quote = byte
-        elif byte == ord(">"):
-            return index + 1
-    return len(content)

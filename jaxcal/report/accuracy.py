@@ -78,9 +78,8 @@ def accuracy_record(
     """
     nothing = {"tre": None, "limits": None, "influence": None, "comparison": None}
     answer = result.numpy()
-    if not np.isfinite(answer.unknowns_covariance).all() or not bool(result.converged):
-        return nothing
-    if result.wrong_frames is not None:
+    determined = np.isfinite(answer.unknowns_covariance).all() and bool(result.converged)
+    if not determined or result.wrong_frames is not None:
         return nothing
     region = region_of(answer, recording)
     grid = region.grid()[:, [0, 2]]
@@ -147,11 +146,7 @@ def _tre(
     cells = region.grid(_ACROSS, _ACROSS).reshape(_ACROSS, _ACROSS, 3)[..., [0, 2]]
     mapped = tre_at(answer, cells)
     return {
-        "region": {
-            "lateral_mm": region.lateral_mm,
-            "depth_mm": region.depth_mm,
-            "radius_mm": region.radius_mm,
-        },
+        "region": vars(region),
         "unit": "px" if pixels else "mm",
         "stated_mm": over.rms,
         "stated_interval_mm": [over.lower, over.upper],
@@ -249,12 +244,10 @@ def _comparison(
     answer: Calibration, found: Influence, grid: Float[np.ndarray, "m 2"]
 ) -> dict[str, Any] | None:
     """Compares an answer of another method with the conventional fit of the same images."""
-    estimate = tuple(name for name in ("scale",) if name in answer.blocks)
+    estimate = ("scale",) if "scale" in answer.blocks else ()
     further = {"sound-speed", "delay"} & set(answer.blocks)
     problem = answer.problem
-    if answer.method == "conventional" or further or problem is None:
-        return None
-    if answer.data == "channels":
+    if answer.method == "conventional" or answer.data == "channels" or further or problem is None:
         return None
     used = np.asarray(answer.mask) > 0
     try:
@@ -279,19 +272,19 @@ def _comparison(
     face = float(np.asarray(problem.face_offset))
     apart = distance(np.asarray(answer.image_to_probe), x, scale / mine, grid, face)
     density = found.log_density - fit.log_density
-    count = int(used.sum())
+    gain = spread = None
     # Within a bound, offsets fit themselves: their errors are zero, and have no density.
-    dense = answer.prior != "bounded"
+    if answer.prior != "bounded":
+        gain = float(density.sum())
+        spread = float(np.std(density[used], ddof=1) * math.sqrt(used.sum()))
     return {
         "conventional_rms_mm": float(other.rms_mm),
         "rms_mm": float(answer.rms),
         "apart_mm": apart,
         "conventional_tre_mm": math.sqrt(error) if error > 0 else None,
         "tre_mm": math.sqrt(gaussian) if gaussian > 0 else None,
-        "log_density_gain": float(density.sum()) if dense else None,
-        "log_density_gain_sd": float(np.std(density[used], ddof=1) * math.sqrt(count))
-        if dense
-        else None,
+        "log_density_gain": gain,
+        "log_density_gain_sd": spread,
         "conventional_image_plane_to_probe": x,
     }
 

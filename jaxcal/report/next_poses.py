@@ -35,9 +35,8 @@ def next_poses_record(
         images are in pixels), ``pose`` (4x4, probe -> tracker),
         ``fills_space`` and ``tre_mm``, the error with this pose and those before it.
     """
-    if result.status == "failed" or result.wrong_frames is not None:
-        return None
-    if NOT_PLANNED in result.blocks:
+    wrong = result.status == "failed" or result.wrong_frames is not None
+    if wrong or NOT_PLANNED in result.blocks:
         return None
     try:
         candidates = design.candidates_around(

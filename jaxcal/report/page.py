@@ -40,6 +40,7 @@ from jaxcal.report.verdict import (
     length_form,
     limits,
     scatter,
+    usable,
     verdict_word,
     where,
     why_larger,
@@ -105,20 +106,18 @@ def _is_page(path: str | os.PathLike[str]) -> bool:
 def page(record: dict[str, Any], result: Calibration, recording: Recording) -> str:
     """The page as text."""
     answer = result.numpy()
+    sections = [_head(record), _findings(record)]
     # With wrong frames there are no results to copy or to trust.
-    known = _usable(record)
-    sections = [
-        _head(record),
-        _findings(record),
-        *([_accuracy(record, answer, recording)] if known and record["tre"] is not None else []),
-        *([_matrix(record)] if known else []),
-        *([_scene(record, answer, recording)] if known else []),
-        *([_residuals(record, answer)] if known else []),
-        *([_limits(record)] if known and record["limits"] is not None else []),
-        *([_comparison(record)] if known else []),
-        _observability(record),
-        _facts(record),
-    ]
+    if usable(record):
+        sections += [
+            _accuracy(record, answer, recording),
+            _matrix(record),
+            _scene(record, answer, recording),
+            _residuals(record, answer),
+            _limits(record),
+            _comparison(record),
+        ]
+    sections += [_observability(record), _facts(record)]
     name = escape(Path(record["source"]).name)
     files = resources.files("jaxcal.report")
     style = (files / "page.css").read_text("utf-8")
@@ -133,10 +132,6 @@ def page(record: dict[str, Any], result: Calibration, recording: Recording) -> s
         + f"\n{_embedded('record', _shortened(record))}\n<script>\n{script}</script>\n"
         "</body></html>\n"
     )
-
-
-def _usable(record: dict[str, Any]) -> bool:
-    return record["status"] in ("converged", "max_iterations") and not record.get("wrong_frames")
 
 
 def _embedded(name: str, value: Any) -> str:
@@ -214,7 +209,7 @@ def _head(record: dict[str, Any]) -> str:
     tre = record["tre"]
     kind = escape(record["verdict"] or "uncertain")
     number = ""
-    if _usable(record) and tre is not None and tre.get("rms_mm") is not None:
+    if usable(record) and tre is not None and tre.get("rms_mm") is not None:
         number = (
             f'<div><span class="big">{_length(record, "tre.rms_mm", "mm")}</span>'
             "<small>error to expect at the image (TRE, root mean square)<br>95 % interval "
@@ -223,7 +218,7 @@ def _head(record: dict[str, Any]) -> str:
         )
     prior = "" if record["prior"] == "none" else f", prior {record['prior']}"
     said = [headline(record)]
-    if _usable(record):
+    if usable(record):
         said += [*why_larger(record), *where(record)]
         said += [*listed("What limits it", limits(record)), *scatter(record)]
     return (
@@ -239,15 +234,12 @@ def _head(record: dict[str, Any]) -> str:
 
 def _findings(record: dict[str, Any]) -> str:
     """What looks wrong, from all checks, and what to do about it."""
-    found = [str(text) for text in [*record.get("findings", ()), *record["warnings"]]]
     parts = []
-    if found:
+    if found := record["warnings"]:
         parts += ["<h3>Look at this</h3>", _paragraphs([BULLET + text for text in found])]
-    todo = advice(record)
-    if todo:
+    if todo := advice(record):
         parts += ["<h3>What to do</h3>", _paragraphs([BULLET + text for text in todo])]
-    more = next_poses_sentences(record)
-    if more:
+    if more := next_poses_sentences(record):
         parts += ["<h3>Which images to add</h3>", _paragraphs(more)]
     return _section("What to look at, and what to do", *parts) if parts else ""
 
@@ -266,6 +258,8 @@ def map_of_error(record: dict[str, Any], answer: Calibration, recording: Recordi
 
 def _accuracy(record: dict[str, Any], answer: Calibration, recording: Recording) -> str:
     tre, rows = record["tre"], []
+    if tre is None:
+        return ""
     for k, point in enumerate(tre["points"]):
         path = f"tre.points.{k}"
         u, v = (_number(record, f"{path}.image.{axis}", "z.1f") for axis in range(2))
@@ -328,16 +322,13 @@ def _scene(record: dict[str, Any], answer: Calibration, recording: Recording) ->
     poses = recording.calibration.poses[shown]
     images, seen = poses @ x, targets_in_images(poses, x, point)
     # The measured point is in the plane, at the measured lateral position and range.
-    residual = np.asarray(answer.residual)[shown]
-    measured = seen - residual
-    cloud = np.asarray(reconstruct(x, recording.calibration.poses[shown], measured))
+    cloud = np.asarray(reconstruct(x, poses, seen - np.asarray(answer.residual)[shown]))
     wide = max(float(np.ptp(seen[:, 0])) / 2, 10.0)
     deep = float(seen[:, 2].max())
     middle = float(0.5 * (seen[:, 0].min() + seen[:, 0].max()))
     across, down = np.array([-1, 1, 1, -1, -1]), np.array([0, 0, 1, 1, 0])
     corners = np.stack([middle + wide * across, 0.0 * down, deep * down], axis=-1)
-    frames = images[:, None, :3, :3] @ corners[None, :, :, None]
-    frames = frames[..., 0] + images[:, None, :3, 3]
+    frames = corners @ np.swapaxes(images[:, :3, :3], 1, 2) + images[:, None, :3, 3]
     far = np.concatenate([frames.reshape(-1, 3), point[None]])
     centre = 0.5 * (far.min(axis=0) + far.max(axis=0))
     lines = [
@@ -358,31 +349,27 @@ def _scene(record: dict[str, Any], answer: Calibration, recording: Recording) ->
     }
     close = _close_up(answer, cloud, shown)
     ellipsoid = " with its 95 % ellipsoid (lines)" if close["lines"] else ""
-    views = (
-        (
-            whole,
-            "scene-all",
-            "Planes of the images (blue) and the target (orange), in the tracker's frame.",
-        ),
-        (
-            close,
-            "scene-target",
-            "The target's position by each image (green; orange: an image that does not fit the "
-            f"rest), and its estimate{ellipsoid}.",
-        ),
+    all_images = "Planes of the images (blue) and the target (orange), in the tracker's frame."
+    by_image = (
+        "The target's position by each image (green; orange: an image that does not fit the "
+        f"rest), and its estimate{ellipsoid}."
     )
-    parts = [
-        f'<figure>{_embedded(name, data)}<svg class="scene" viewBox="0 0 380 300" role="img" '
-        f'tabindex="0" aria-label="{escape(words)}" data-scene="{name}"></svg>'
-        f'<figcaption>{escape(words)} <span class="screen">Drag, or use the arrow keys, to turn.'
-        "</span></figcaption></figure>"
-        for data, name, words in views
-    ]
     place = ", ".join(_number(record, f"point_mm.{k}", ".3f") for k in range(3))
     return _section(
         "In space",
-        f'<div class="grid">{"".join(parts)}</div>',
+        f'<div class="grid">{_view("scene-all", whole, all_images)}'
+        f"{_view('scene-target', close, by_image)}</div>",
         f"<p>Target in the tracker's frame: {place}&nbsp;mm.</p>",
+    )
+
+
+def _view(name: str, scene: dict[str, Any], words: str) -> str:
+    """A figure that the page's script draws and turns."""
+    return (
+        f'<figure>{_embedded(name, scene)}<svg class="scene" viewBox="0 0 380 300" role="img" '
+        f'tabindex="0" aria-label="{escape(words)}" data-scene="{name}"></svg>'
+        f'<figcaption>{escape(words)} <span class="screen">Drag, or use the arrow keys, to turn.'
+        "</span></figcaption></figure>"
     )
 
 
@@ -398,11 +385,10 @@ def _close_up(
         # 7.81: 95 % point of chi squared with three degrees of freedom.
         axes = vectors * np.sqrt(7.81 * np.maximum(values, 0.0))
         reach = float(np.linalg.norm(axes, axis=0).max())
-        round_ = np.linspace(0, 2 * np.pi, 49)
-        for i, j in ((0, 1), (1, 2), (2, 0)):
-            ring = (
-                point + np.outer(np.cos(round_), axes[:, i]) + np.outer(np.sin(round_), axes[:, j])
-            )
+        turned = np.linspace(0, 2 * np.pi, 49)
+        circle = np.stack([np.cos(turned), np.sin(turned)], axis=-1)
+        for pair in ([0, 1], [1, 2], [2, 0]):
+            ring = point + circle @ axes[:, pair].T
             lines.append({"points": _rounded(ring), "colour": "var(--text)", "width": 0.8})
     away = np.linalg.norm(cloud - point, axis=1)
     # A few points that are far off must not shrink the others to a single dot.
@@ -495,8 +481,9 @@ def _residuals(record: dict[str, Any], answer: Calibration) -> str:
 
 
 def _limits(record: dict[str, Any]) -> str:
-    found = record["limits"]
-    rows = []
+    found, rows = record["limits"], []
+    if found is None:
+        return ""
     for title, name in (
         ("Mean square error of the calibration in the image", "error_share"),
         ("Mean square residual of the target", "scatter_share"),
@@ -504,18 +491,14 @@ def _limits(record: dict[str, Any]) -> str:
         shares = [(word, found[name][kind], colour) for kind, word, colour in _KINDS]
         if all(share is not None for _, share, _ in shares):
             rows.append((title, [(word, float(share), colour) for word, share, colour in shares]))
-    sds = " ".join(
-        f"{word} {_length(record, f'sigma_{name}_mm', 'mm')}{mark}"
-        for word, name, mark in (
-            ("lateral", "lateral", ","),
-            ("range", "range", ","),
-            ("out of the plane", "elevation", "."),
-        )
+    sds = ", ".join(
+        f"{word} {_length(record, f'sigma_{name}_mm', 'mm')}"
+        for (_, word, _), name in zip(_KINDS, ("lateral", "range", "elevation"), strict=True)
     )
     drawn = svg.stacked(rows, "Where the errors come from, in shares of mean squares")
     return _section(
         "Where the errors come from",
-        f"<figure>{drawn}</figure><p>Standard deviations found: {sds} Residual, root mean square: "
+        f"<figure>{drawn}</figure><p>Standard deviations found: {sds}. Residual, root mean square: "
         f"{_number(record, 'rms_mm', '.3f', 'mm')}, of which "
         f"{_number(record, 'limits.rms_in_plane_mm', '.3f', 'mm')} in the image plane and "
         f"{_number(record, 'limits.rms_elevational_mm', '.3f', 'mm')} out of it.</p>",
@@ -553,13 +536,13 @@ def _comparison(record: dict[str, Any]) -> str:
 def _observability(record: dict[str, Any]) -> str:
     sight = record["observability"]
     words = [f"Least well determined: {sight['weakest_direction']}."]
-    if _usable(record):
+    if usable(record):
         words += certainty(record)
     proved = certificate_words(record)
     if proved is not None:
         words.append(f"{proved[0].upper()}{proved[1:]}.")
     parts = [_paragraphs(words)]
-    if _usable(record) and record["image_covariance"] is not None:
+    if usable(record) and record["image_covariance"] is not None:
         covariance = np.array(record["image_covariance"], float)
         sd = np.sqrt(np.diagonal(covariance))
         names = record["image_unknowns"]

@@ -73,21 +73,19 @@ def plot_tre(calibration: Calibration, factor: float = 1.0) -> Figure:
     region = region_of(answer, recording)
     cells = region.grid(_ALONG_A_SIDE, _ALONG_A_SIDE)[:, [0, 2]]
     cells = cells.reshape(_ALONG_A_SIDE, _ALONG_A_SIDE, 2)
+    lateral, depth = cells[..., 0], cells[..., 1]
     error = factor * tre_at(answer, cells).rms
     figure = canvas(COLUMN_MM, COLUMN_MM)
     # Axes of equal scale shrink after they are laid out, and only this layout sees it.
     figure.set_layout_engine("compressed")
     axes = styled(figure.subplots())
     mesh = axes.pcolormesh(
-        cells[..., 0], cells[..., 1], error, cmap="viridis", shading="gouraud", rasterized=True
+        lateral, depth, error, cmap="viridis", shading="gouraud", rasterized=True
     )
-    lines = axes.contour(
-        cells[..., 0], cells[..., 1], error, colors="white", linewidths=0.5, levels=5
-    )
+    lines = axes.contour(lateral, depth, error, colors="white", linewidths=0.5, levels=5)
     axes.clabel(lines, fontsize=6, fmt="%.3g")
     poses = recording.calibration.poses[np.asarray(answer.mask) > 0]
-    seen = targets_in_images(poses, answer.image_to_probe, answer.point)
-    seen = spread_out(seen)
+    seen = spread_out(targets_in_images(poses, answer.image_to_probe, answer.point))
     axes.plot(seen[:, 0], seen[:, 2], "o", ms=1.8, mfc="white", mec="black", mew=0.4)
     axes.set_aspect("equal")
     axes.invert_yaxis()
@@ -96,7 +94,7 @@ def plot_tre(calibration: Calibration, factor: float = 1.0) -> Figure:
     bar.set_label("target registration error (mm)", size=8)
     bar.ax.tick_params(labelsize=7, width=0.6)
     bar.outline.set_linewidth(0.6)  # pyright: ignore[reportCallIssue]
-    _scale_bar(axes, bar_length(float(np.ptp(cells[..., 0]))))
+    _scale_bar(axes, bar_length(float(np.ptp(lateral))))
     return figure
 
 
@@ -115,20 +113,15 @@ def plot_residuals(calibration: Calibration) -> Figure:
     ):
         styled(panel)
         panel.axhline(0.0, color=GREY, linewidth=0.5)
-        shown = used[drawn(residual[used, axis], np.searchsorted(used, named))]
-        panel.vlines(shown, 0.0, residual[shown, axis], color=COLOURS[name], linewidth=0.7)
-        panel.plot(shown, residual[shown, axis], "o", color=COLOURS[name], ms=2.2)
+        values, colour = residual[:, axis], COLOURS[name]
+        shown = used[drawn(values[used], np.searchsorted(used, named))]
+        panel.vlines(shown, 0.0, values[shown], color=colour, linewidth=0.7)
+        panel.plot(shown, values[shown], "o", color=colour, ms=2.2)
         if len(named):
             ringed = np.intersect1d(named, shown)
+            label = "does not fit the rest, or suspicious"
             panel.plot(
-                ringed,
-                residual[ringed, axis],
-                "o",
-                ms=6,
-                mfc="none",
-                mec="black",
-                mew=0.7,
-                label="does not fit the rest, or suspicious",
+                ringed, values[ringed], "o", ms=6, mfc="none", mec="black", mew=0.7, label=label
             )
         panel.set_ylabel(f"{name} (mm)")
     if len(named):
@@ -174,16 +167,8 @@ def plot_offsets(calibration: Calibration, truth: Float[np.ndarray, " n"] | None
     )
     resting = np.intersect1d(resting, shown)
     if len(resting):
-        panel.plot(
-            used[resting],
-            offset[resting],
-            "s",
-            ms=5,
-            mfc="none",
-            mec=GREEN,
-            mew=0.8,
-            label="at its bound",
-        )
+        at_bound = used[resting], offset[resting]
+        panel.plot(*at_bound, "s", ms=5, mfc="none", mec=GREEN, mew=0.8, label="at its bound")
     if truth is not None:
         panel.plot(used[shown], truth[used[shown]], "x", color="black", ms=3, mew=0.7, label="true")
     _legend(panel)
@@ -205,15 +190,8 @@ def plot_influence(calibration: Calibration) -> Figure:
     shown = used[drawn(moved[used], np.searchsorted(used, most))]
     panel.vlines(shown, 0.0, moved[shown], color=BLUE, linewidth=0.8)
     panel.plot(shown, moved[shown], "o", color=BLUE, ms=2.4, label="by leaving it out")
-    panel.plot(
-        shown,
-        expected[shown],
-        "_",
-        color="black",
-        ms=4,
-        mew=0.8,
-        label="if the noise model holds (SD)",
-    )
+    label = "if the noise model holds (SD)"
+    panel.plot(shown, expected[shown], "_", color="black", ms=4, mew=0.8, label=label)
     for image in most:
         panel.annotate(
             str(image),
@@ -244,19 +222,11 @@ def plot_limits(calibration: Calibration) -> Figure:
     for row, values in enumerate((scatter_shares(answer), shares)):
         left = 0.0
         for kind, share in zip(KINDS, values, strict=True):
-            panel.barh(
+            bar = panel.barh(
                 row, share, left=left, color=COLOURS[kind], height=0.6, label=kind if row else None
             )
-            if share > 0.05:
-                panel.text(
-                    left + share / 2,
-                    row,
-                    f"{100 * share:.0f} %",
-                    ha="center",
-                    va="center",
-                    color="white",
-                    fontsize=7,
-                )
+            told = f"{100 * share:.0f} %" if share > 0.05 else ""
+            panel.bar_label(bar, [told], label_type="center", color="white", fontsize=7)
             left += share
     panel.set_yticks([0, 1], rows)
     panel.set(xlim=(0, 1), xlabel="share of the mean square")

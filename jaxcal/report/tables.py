@@ -21,10 +21,10 @@ _IN_OWN_UNITS = ("scale", "sound-speed", "delay")
 def calibration_table(record: dict[str, Any]) -> RenderableType:
     """One calibration: transform, target, errors and quality."""
     transform = Table(title=title_of_transform(record), box=box.SIMPLE, show_header=False)
+    for _ in range(4):
+        transform.add_column(justify="right")
     for row in record["image_plane_to_probe"]:
         transform.add_row(*(_number(value, ".6f") for value in row))
-    for _ in range(4):
-        transform.columns[_].justify = "right"
 
     facts = Table(box=box.SIMPLE, show_header=False)
     facts.add_column(style="bold")
@@ -34,10 +34,8 @@ def calibration_table(record: dict[str, Any]) -> RenderableType:
     return Group(transform, facts)
 
 
-def comparison_table(
-    records: dict[str, dict[str, Any]], milliseconds: dict[str, float] | None = None
-) -> Table:
-    """Several calibrations of one recording by name, a row each, with solve times if measured."""
+def comparison_table(records: dict[str, dict[str, Any]], milliseconds: dict[str, float]) -> Table:
+    """Several calibrations of one recording by name, a row each, with the times of their solves."""
     table = Table(box=box.SIMPLE)
     table.add_column("method", style="bold")
     for heading in (
@@ -46,7 +44,7 @@ def comparison_table(
         "error of X\n(deg)",
         "RMS\n(mm)",
         "iterations",
-        *(["solve\n(ms)"] if milliseconds else []),
+        "solve\n(ms)",
     ):
         table.add_column(heading, justify="right")
     table.add_column("status")
@@ -58,59 +56,43 @@ def comparison_table(
             _number(error.get("rotation_deg"), ".3f"),
             _number(record["rms_mm"], ".3f"),
             str(record["iterations"]),
+            _number(milliseconds.get(name), ".1f"),
         ]
-        if milliseconds:
-            cells.append(_number(milliseconds.get(name), ".1f"))
         table.add_row(name, *cells, record["status"])
     return table
 
 
 def _facts(record: dict[str, Any]) -> list[tuple[str, str]]:
     prior = "" if record["prior"] == "none" else f", {record['prior']} prior"
+    kinds = ("lateral", "range", "elevation")
+    lateral, along, elevational = (_number(record[f"sigma_{kind}_mm"], ".3f") for kind in kinds)
     facts = [
         *_accuracy(record),
         ("method", f"{record['method']}{prior}"),
         ("status", f"{record['status']} after {counted(record['iterations'], 'iteration')}"),
         ("images", f"{record['images_used']} used of {record['images']}"),
         *frames_and_target(record),
-        (
-            "error SD (mm)",
-            f"lateral {_number(record['sigma_lateral_mm'], '.3f')}, "
-            f"range {_number(record['sigma_range_mm'], '.3f')}, "
-            f"elevational {_number(record['sigma_elevation_mm'], '.3f')}",
-        ),
+        ("error SD (mm)", f"lateral {lateral}, range {along}, elevational {elevational}"),
         ("residual RMS (mm)", _residuals(record)),
         (
             f"reconstruction precision, {record['reconstruction_precision_set']} images (mm)",
             _number(record["reconstruction_precision_mm"], ".3f"),
         ),
     ]
-    proved = certificate_words(record)
-    if proved is not None:
+    if (proved := certificate_words(record)) is not None:
         facts.append(("global minimum", proved))
-    spread = spread_of_transform(record)
-    if spread is not None:
+    if (spread := spread_of_transform(record)) is not None:
         facts.append(("SD of image_plane_to_probe", f"{spread[0]:.3f} mm, {spread[1]:.3f} deg"))
     facts += further_facts(record)
     sight = record["observability"]
     # If the direction is not determined at all, the SD only shows where rounding begins.
     sd = sight["weakest_sd_mm"] if record["status"] != "unobservable" else None
-    facts.append(
-        (
-            "least well determined",
-            sight["weakest_direction"] + ("" if sd is None else f" (SD {sd:.2f} mm)"),
-        )
-    )
+    told = "" if sd is None else f" (SD {sd:.2f} mm)"
+    facts.append(("least well determined", sight["weakest_direction"] + told))
     if "truth_error" in record:
-        error = record["truth_error"]
-        facts.append(
-            (
-                "error against truth",
-                f"{_number(error['translation_mm'], '.3f')} mm, "
-                f"{_number(error['rotation_deg'], '.3f')} deg; "
-                f"target {_number(error['point_mm'], '.3f')} mm",
-            )
-        )
+        names = ("translation_mm", "rotation_deg", "point_mm")
+        moved, turned, target = (_number(record["truth_error"][name], ".3f") for name in names)
+        facts.append(("error against truth", f"{moved} mm, {turned} deg; target {target} mm"))
     return facts
 
 
@@ -166,11 +148,11 @@ def _accuracy(record: dict[str, Any]) -> list[tuple[str, str]]:
     facts = [("error to expect at the image (mm)", shown(tre["rms_mm"], tre["interval_95_mm"]))]
     for point in tre["points"]:
         u, v = point["image"]
-        place = f"({u:g}, {v:g})" if point["name"] == "asked for" else f"({u:z.0f}, {v:z.0f})"
-        named = "" if point["name"] == "asked for" else f"{point['name']} "
-        facts.append(
-            (f"  at {named}{place} {tre['unit']}", shown(point["tre_mm"], point["interval_95_mm"]))
-        )
+        place = f"{point['name']} ({u:z.0f}, {v:z.0f})"
+        if point["name"] == "asked for":
+            place = f"({u:g}, {v:g})"
+        error = shown(point["tre_mm"], point["interval_95_mm"])
+        facts.append((f"  at {place} {tre['unit']}", error))
     return facts
 
 

@@ -41,18 +41,21 @@ _KINDS = {
 def verdict(record: dict[str, Any]) -> list[str]:
     """Sentences for a person, most important first, as :mod:`jaxcal.report.paragraphs` has them."""
     lines = [headline(record)]
-    usable = record["status"] in ("converged", "max_iterations")
-    usable = usable and not record.get("wrong_frames")
-    if usable:
+    if usable(record):
         lines += [*why_larger(record), *where(record)]
     further = [text for text in record["warnings"] if text not in lines[0]]
     lines += [*listed("Look at this", further), *listed("What to do", advice(record))]
-    if usable:
+    if usable(record):
         lines += listed("What limits it", limits(record))
         lines += listed("How certain it is", [*certainty(record), *resampled_sentences(record)])
         lines += listed("How the images agree with it", [*scatter(record), *believe(record)])
         lines += listed("Which images", frames_of_images(record))
     return lines
+
+
+def usable(record: dict[str, Any]) -> bool:
+    """Whether there is an answer, of data in the right frames, to be told about."""
+    return record["status"] in ("converged", "max_iterations") and not record.get("wrong_frames")
 
 
 def frames_of_images(record: dict[str, Any]) -> list[str]:
@@ -76,8 +79,7 @@ def headline(record: dict[str, Any]) -> str:
     status, tre = record["status"], record.get("tre")
     if status == "failed":
         return "Failed: there is no calibration."
-    if record.get("wrong_frames"):
-        told = record["wrong_frames"]
+    if told := record.get("wrong_frames"):
         return f"Do not use: {_ended(told)}"
     if status == "unobservable":
         return "Do not use: these images do not determine the calibration."
@@ -165,8 +167,8 @@ def where(record: dict[str, Any]) -> list[str]:
 
 def _place(point: dict[str, Any]) -> str:
     lateral, axial = map(round, point["position_mm"])
-    words = {"middle": "the middle"}.get(point["name"], f"the {point['name']} corner")
-    return f"{words} (lateral {lateral}, depth {axial} mm)"
+    corner = "" if point["name"] == "middle" else " corner"
+    return f"the {point['name']}{corner} (lateral {lateral}, depth {axial} mm)"
 
 
 def limits(record: dict[str, Any]) -> list[str]:
@@ -213,14 +215,12 @@ def scatter(record: dict[str, Any]) -> list[str]:
     of_calibration = record["reconstruction_precision_set"] == "calibration"
     tested = "" if of_calibration else f"{record['reconstruction_precision_images']} "
     counted = " (those left out included)" if left_out and of_calibration else ""
-    shown = (
-        ""
-        if precision is None
-        else (
+    shown = ""
+    if precision is not None:
+        shown = (
             f"; reconstruction precision (Eq. 8) over the {tested}"
             f"{record['reconstruction_precision_set']} images{counted}: {_mm(precision)}"
         )
-    )
     ranked = sorted(found["scatter_share"].items(), key=lambda item: -(item[1] or 0.0))
     told = [f"{100 * share:.0f} % {_KINDS[kind]}" for kind, share in ranked if share is not None]
     tre, within = record["tre"], record["rms_mm"] or 0.0

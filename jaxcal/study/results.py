@@ -86,20 +86,15 @@ def read_all(store: Store[Spec], *, incomplete: bool = False) -> dict[str, np.nd
             "missing: finish it with 'jaxcal study run ... --resume'"
         )
     whole = spec.arrays(Chunk(0, 0, 0, spec.trials))
-    shapes = {name: (spec.condition_count, *array.shape) for name, array in whole.items()}
-    integers = {"status": np.int8, "iterations": np.int32}
+    empty = {"status": np.int8(MISSING), "iterations": np.int32(MISSING)}
     values = {
-        name: np.full(shape, MISSING if name in integers else np.nan, integers.get(name, float))
-        for name, shape in shapes.items()
+        name: np.full((spec.condition_count, *array.shape), empty.get(name, np.nan))
+        for name, array in whole.items()
     }
     for index in present:
         chunk = spec.chunk(index)
         part = slice(chunk.start, chunk.stop)
         for name, array in store.read(chunk).items():
-            place = (
-                (chunk.condition, part)
-                if name == "realised"
-                else (chunk.condition, slice(None), part)
-            )
-            values[name][place] = array
+            of_condition = values[name][chunk.condition]
+            of_condition[part if name == "realised" else (slice(None), part)] = array
     return values

@@ -117,11 +117,10 @@ def _row(
 ) -> Row:
     rp, status = got["rp"][k], got["status"][k]
     finite = np.isfinite(rp)
-    mean = mean_interval(rp) or (None, None, None)
-    paired = None
+    unknown = (None, None, None)
+    mean, difference = mean_interval(rp) or unknown, unknown
     if reference is not None and k != reference:
-        paired = mean_interval(rp - got["rp"][reference])
-    difference = paired or (None, None, None)
+        difference = mean_interval(rp - got["rp"][reference]) or unknown
     bound = bound_mm(spec.methods[k], condition)
     return Row(
         method=spec.methods[k].name,

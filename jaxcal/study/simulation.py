@@ -53,6 +53,22 @@ Scalar = float | Float[Array, ""]
 """A number of a protocol: plain, or traced, so that one compiled program serves all its values."""
 
 
+_LARGEST = {
+    "elevation_mm": (1000, " mm"),
+    "noise_mm": (1000, " mm"),
+    "lateral_mm": (1000, " mm"),
+    "depth_mm": (1000, " mm"),
+    "rotation_rad": (4, " rad"),
+    "test_fraction": (10, ""),
+    "sector": (1, ""),
+    "tracker_mm": (1000, " mm"),
+    "tracker_rad": (1, " rad"),
+}
+"""Largest value and unit of the numbers of a protocol; the least is 0."""
+NUMBERS = tuple(_LARGEST)
+"""Fields of a protocol that are arguments of a program, so that one serves all their values."""
+
+
 @dataclass(frozen=True)
 class Protocol:
     """The distributions of a simulated experiment.
@@ -100,20 +116,10 @@ class Protocol:
             shallow, deep = self.depth_mm
         except (TypeError, ValueError):
             raise InputError("depth_mm must be two numbers: nearest and farthest") from None
-        for name, value, largest, unit in (
-            ("elevation_mm", self.elevation_mm, 1000, " mm"),
-            ("noise_mm", self.noise_mm, 1000, " mm"),
-            ("lateral_mm", self.lateral_mm, 1000, " mm"),
-            ("depth_mm", shallow, 1000, " mm"),
-            ("depth_mm", deep, 1000, " mm"),
-            ("rotation_rad", self.rotation_rad, 4, " rad"),
-            ("test_fraction", self.test_fraction, 10, ""),
-            ("sector", self.sector, 1, ""),
-            ("tracker_mm", self.tracker_mm, 1000, " mm"),
-            ("tracker_rad", self.tracker_rad, 1, " rad"),
-        ):
-            if not is_traced(value) and not _is_within(value, largest):
-                raise InputError(f"{name} must be between 0 and {largest}{unit}, not {value}")
+        for name, (largest, unit) in _LARGEST.items():
+            for value in self.depth_mm if name == "depth_mm" else (getattr(self, name),):
+                if not is_traced(value) and not _is_within(value, largest):
+                    raise InputError(f"{name} must be between 0 and {largest}{unit}, not {value}")
         if not is_traced(self.depth_mm) and shallow > deep:
             raise InputError(f"depth_mm must be nearest, then farthest, not {self.depth_mm}")
         check_law(self.elevation_distribution)
@@ -450,20 +456,6 @@ def times_of_flight(
     if (counted == 0).any():
         raise InputError(f"a clock of {clock_hz:g} Hz is too slow: it counts no period of a time")
     return counted / clock_hz
-
-
-NUMBERS: tuple[str, ...] = (
-    "elevation_mm",
-    "noise_mm",
-    "lateral_mm",
-    "depth_mm",
-    "rotation_rad",
-    "test_fraction",
-    "sector",
-    "tracker_mm",
-    "tracker_rad",
-)
-"""Fields of a protocol that are arguments of a program, so that one serves all their values."""
 
 
 def split_protocol(protocol: Protocol) -> tuple[Protocol, dict[str, np.ndarray]]:

@@ -70,9 +70,6 @@ from jaxcal.solvers.plan import DEFAULT_MAX_ELEVATION_MM, Options, Prior
 from jaxcal.study.interface import ArraySpec, Chunk
 from jaxcal.study.laws import LawName, check_law
 
-MAXIMUM_BYTES = 2**20
-"""Largest spec that is read."""
-
 MAXIMUM_EXPERIMENTS = 2**32
 """Conditions times trials: fold_in takes 32 bits."""
 
@@ -84,22 +81,6 @@ MAXIMUM_DISTANCES = 2**22
 
 MAXIMUM_CHUNK = 2**24
 """Trials times methods of one chunk, whose results are held at once."""
-
-AXES = (
-    "elevation_distribution",
-    "images",
-    "test_images",
-    "test_fraction",
-    "lateral_mm",
-    "depth_min_mm",
-    "depth_max_mm",
-    "rotation_deg",
-    "tracker_mm",
-    "tracker_deg",
-    "elevation_mm",
-    "noise_mm",
-)
-"""The fields of ``[conditions]`` in the order in which the grid is counted, the last fastest."""
 
 UNITS = {
     "rp": "mm",
@@ -114,24 +95,19 @@ UNITS = {
 """Unit of every array of a chunk."""
 
 _COUNTS = {"images": (4, 100_000), "test_images": (2, 100_000)}
-_LIMITS = {
-    "elevation_mm": (0.0, 1000.0),
-    "noise_mm": (0.0, 1000.0),
-    "lateral_mm": (0.0, 1000.0),
-    "depth_min_mm": (0.0, 1000.0),
-    "depth_max_mm": (0.0, 1000.0),
-    "rotation_deg": (0.0, 180.0),
-    "test_fraction": (0.0, 10.0),
-    "tracker_mm": (0.0, 1000.0),
-    "tracker_deg": (0.0, 57.0),
-}
+_LARGEST = {"rotation_deg": 180.0, "test_fraction": 10.0, "tracker_deg": 57.0}
+_LARGEST_MM = 1000.0
+"""Of every number of ``[conditions]`` that is in mm; the least is 0."""
 _UNITS = ("_mm", "_deg", "_rad")
 _FLOATS = ("max_elevation_mm", "max_elevation_factor", "tolerance_rad", "tolerance_mm")
 
 
 @dataclass(frozen=True)
 class Condition:
-    """One cell of the grid; the fields are those of ``[conditions]``, each with one value."""
+    """One cell of the grid; the fields are those of ``[conditions]``, each with one value.
+
+    Their order is that in which the grid is counted, the last fastest.
+    """
 
     elevation_distribution: LawName = "uniform"
     images: int = 50
@@ -145,6 +121,9 @@ class Condition:
     tracker_deg: float = 0.0
     elevation_mm: float = 1.0
     noise_mm: float = 0.5
+
+
+AXES = tuple(field.name for field in fields(Condition))
 
 
 @dataclass(frozen=True)
@@ -221,7 +200,8 @@ class Spec:
         trials: in each condition.
         chunk_trials: most trials in one file.
         axes: for every field of :data:`AXES`, its values.
-        listed: names of the fields that were given as lists, which are the axes of the results.
+        listed: names of the fields that were given as lists, which are the axes of the results; in
+            the order of :data:`AXES`, whatever that of the file.
         probe: the transducer.
         methods: in the order of the file.
     """
@@ -274,10 +254,7 @@ class Spec:
 
     def canonical(self) -> str:
         """The spec as one JSON text that does not depend on how the file was laid out."""
-        content = asdict(self)
-        content["axes"] = {name: list(values) for name, values in self.axes}
-        # In the order of AXES: whether the file lists noise or elevation first changes nothing.
-        content["listed"] = list(self.listed)
+        content = asdict(self) | {"axes": dict(self.axes)}
         return json.dumps(content, sort_keys=True, allow_nan=False)
 
     @property
@@ -294,17 +271,20 @@ class Spec:
         """
         try:
             content = json.loads(text)
-            given = content["axes"]
+            conditions = {
+                name: values if name in content["listed"] else values[0]
+                for name, values in content["axes"].items()
+            }
             spec = cls(
                 *_head(content),
-                tuple((name, tuple(given[name])) for name in AXES),
-                tuple(content["listed"]),
+                *_axes(conditions),
                 LinearProbe(**content["probe"]),
                 tuple(MethodSpec(**method) for method in content["methods"]),
             )
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            same = spec.canonical() == text
+        except (ValueError, LookupError, TypeError, AttributeError, OverflowError) as error:
             raise InputError(f"is not a study's canonical spec: {error}") from None
-        if spec.canonical() != text:
+        if not same:
             raise InputError("is not a study's canonical spec")
         _check_size(spec)
         return spec
@@ -341,7 +321,7 @@ def load_spec(path: str | os.PathLike[str]) -> Spec:
             starts with the path.
     """
     with naming(path):
-        return _spec(load_toml(path, maximum_bytes=MAXIMUM_BYTES))
+        return _spec(load_toml(path))
 
 
 def parse_spec(text: str) -> Spec:
@@ -401,7 +381,8 @@ def _table(content: dict[str, Any], key: str) -> dict[str, Any]:
     return table
 
 
-def _number(name: str, value: object, least: float, most: float, *, above: bool = False) -> float:
+def _number(name: str, value: object, most: float, *, zero: bool) -> float:
+    """A number up to ``most`` that is positive or, if allowed, zero."""
     if isinstance(value, str):
         raise InputError(
             f"{name} must be a plain number (its unit is in its name), not {shown(value)}"
@@ -409,8 +390,8 @@ def _number(name: str, value: object, least: float, most: float, *, above: bool 
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise InputError(f"{name} must be a number, not {shown(value)}")
     number = _float(value)
-    if not least <= number <= most or (above and number == least):
-        span = f"more than {least:g} and at most" if above else f"between {least:g} and"
+    if not 0 <= number <= most or (number == 0 and not zero):
+        span = "between 0 and" if zero else "more than 0 and at most"
         raise InputError(f"{name} must be {span} {most:g}, not {shown(value)}")
     return number
 
@@ -451,17 +432,15 @@ def _condition_value(name: str, label: str, value: object) -> float | int | str:
         return str(value)
     if name in _COUNTS:
         return whole_number(label, value, *_COUNTS[name])
-    above = name in ("depth_min_mm", "depth_max_mm")
-    return _number(label, value, *_LIMITS[name], above=above)
+    zero = name not in ("depth_min_mm", "depth_max_mm")
+    return _number(label, value, _LARGEST.get(name, _LARGEST_MM), zero=zero)
 
 
 def _probe(table: dict[str, Any]) -> LinearProbe:
     _known(table, {"elements", "pitch_mm"}, "probe.")
     default = LinearProbe()
     elements = whole_number("probe.elements", table.get("elements", default.elements), 2, 4096)
-    pitch = _number(
-        "probe.pitch_mm", table.get("pitch_mm", default.pitch_mm), 0.0, 99.0, above=True
-    )
+    pitch = _number("probe.pitch_mm", table.get("pitch_mm", default.pitch_mm), 99.0, zero=False)
     return LinearProbe(elements=elements, pitch_mm=pitch)
 
 

@@ -28,10 +28,11 @@ import numpy as np
 
 from jaxcal import FormatError, InputError, MissingFileError
 from jaxcal.io.atomic import made_folder, write_bytes, write_text
-from jaxcal.io.given_files import check_readable, one_line, path_name
+from jaxcal.io.given_files import check_readable, naming, one_line, path_name
+from jaxcal.io.toml import MAXIMUM_BYTES
 from jaxcal.io.untrusted import array, child, number, open_root, text
 from jaxcal.study.interface import Chunk, Study
-from jaxcal.study.spec import MAXIMUM_BYTES, Spec
+from jaxcal.study.spec import Spec
 
 FORMAT = "jaxcal-study-chunk"
 VERSION = 1
@@ -137,22 +138,18 @@ class Store(Generic[S]):
             OutputError: the disk is full, the folder not writable.
         """
         start = chunk.condition * self.spec.trials
-        wanted = self.spec.arrays(chunk)
-        results = {name: results[name] for name in wanted}
+        units = {name: wanted.unit for name, wanted in self.spec.arrays(chunk).items()}
+        results = {name: results[name] for name in units}
         attributes = {
             "format": FORMAT,
             "version": VERSION,
             "spec_sha256": self.spec.sha256,
-            "chunk": chunk.index,
-            "condition": chunk.condition,
-            "trial_start": chunk.start,
-            "trial_stop": chunk.stop,
+            **_place(chunk),
             "index_start": start + chunk.start,
             "index_stop": start + chunk.stop,
             "checksum": _checksum(results),
             **maker,
         }
-        units = {name: array_spec.unit for name, array_spec in wanted.items()}
         # HDF5 notices a full disk only when it closes the file, and then loses the reason. A file
         # that is made in memory and written in one go reports it.
         write_bytes(self.path(chunk), _pack(results, attributes, units))
@@ -165,42 +162,29 @@ class Store(Generic[S]):
         """
         path = self.path(chunk)
         check_readable(path)
-        try:
-            return self._read(path, chunk)
-        except FormatError as error:
-            raise FormatError(f"{path}: {error}") from None
-
-    def versions(self, chunk: Chunk) -> str:
-        """What computed a chunk: versions and device, in words."""
-        with open_root(self.path(chunk)) as root:
-            parts = [text(root, name) or "?" for name in ("jaxcal", "jax", "device")]
-        return f"jaxcal {parts[0]}, jax {parts[1]}, {parts[2]}"
-
-    def _read(self, path: Path, chunk: Chunk) -> dict[str, np.ndarray]:
-        with open_root(path) as root:
+        with naming(path), open_root(path) as root:
             if text(root, "format") != FORMAT or number(root, "version") != VERSION:
                 raise FormatError(f"is not a {FORMAT} of version {VERSION}")
             if text(root, "spec_sha256") != self.spec.sha256:
                 raise FormatError("belongs to another spec")
-            agreed = {
-                "chunk": chunk.index,
-                "condition": chunk.condition,
-                "trial_start": chunk.start,
-                "trial_stop": chunk.stop,
-            }
-            for name, value in agreed.items():
+            for name, value in _place(chunk).items():
                 if number(root, name) != value:
                     raise FormatError(f"its {name} is not {value}")
-            checksum = text(root, "checksum")
             results = {}
             for name, wanted in self.spec.arrays(chunk).items():
                 node = child(root, name)
                 if node is None:
                     raise FormatError(f"has no {name}")
                 results[name] = array(node, wanted.shape, wanted.kind)
-        if checksum != _checksum(results):
-            raise FormatError("is damaged: its checksum is wrong")
-        return results
+            if text(root, "checksum") != _checksum(results):
+                raise FormatError("is damaged: its checksum is wrong")
+            return results
+
+    def versions(self, chunk: Chunk) -> str:
+        """What computed a chunk: versions and device, in words."""
+        with open_root(self.path(chunk)) as root:
+            parts = [text(root, name) or "?" for name in ("jaxcal", "jax", "device")]
+        return f"jaxcal {parts[0]}, jax {parts[1]}, {parts[2]}"
 
     @property
     def _spec_path(self) -> Path:
@@ -241,6 +225,16 @@ def read_spec(folder: str | os.PathLike[str], kind: type[Any] = Spec) -> Any:
             f"{path}: is no {kind.__name__}: damaged, of another version of jaxcal, or a study of "
             "another class"
         ) from None
+
+
+def _place(chunk: Chunk) -> dict[str, int]:
+    """The attributes that say which trials a file has."""
+    return {
+        "chunk": chunk.index,
+        "condition": chunk.condition,
+        "trial_start": chunk.start,
+        "trial_stop": chunk.stop,
+    }
 
 
 def _pack(

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections import OrderedDict
 from collections.abc import Iterator
+from functools import lru_cache
 
 import numpy as np
 
@@ -24,7 +24,7 @@ class Frames:
 
     def __init__(self, sequence: TrackedSequence, orientation: str | None = None) -> None:
         self._sequence, self._orientation = sequence, orientation
-        self._kept: OrderedDict[int, bytes] = OrderedDict()
+        self._kept = lru_cache(_KEPT)(self._read)
         self._next = 0
         self._stream: Iterator[np.ndarray] | None = None
         # A page asks for the frame that it shows and for the one after it, in two threads.
@@ -37,30 +37,20 @@ class Frames:
             FormatError: the file is damaged, or does not say how its pixels are oriented.
         """
         with self._lock:
-            if number in self._kept:
-                self._kept.move_to_end(number)
-                return self._kept[number]
-            if self._stream is None or number < self._next:
-                self._begin(number)
-            assert self._stream is not None
-            try:
-                for frame in self._stream:
-                    self._next += 1
-                    if self._next > number:
-                        return self._keep(number, encode_png(frame))
-            except BaseException:
-                self._stream = None
-                raise
-            raise IndexError(number)
+            return self._kept(number)
 
-    def _begin(self, number: int) -> None:
-        # Frames before this one are skipped; only a packed file must be read through them.
-        self._next = number
-        wanted = range(number, len(self._sequence))
-        self._stream = self._sequence.images(wanted, orientation=self._orientation)
-
-    def _keep(self, number: int, content: bytes) -> bytes:
-        self._kept[number] = content
-        if len(self._kept) > _KEPT:
-            self._kept.popitem(last=False)
-        return content
+    def _read(self, number: int) -> bytes:
+        if self._stream is None or number < self._next:
+            # Frames before this one are skipped; only a packed file must be read through them.
+            self._next = number
+            wanted = range(number, len(self._sequence))
+            self._stream = self._sequence.images(wanted, orientation=self._orientation)
+        try:
+            for frame in self._stream:
+                self._next += 1
+                if self._next > number:
+                    return encode_png(frame)
+        except BaseException:
+            self._stream = None
+            raise
+        raise IndexError(number)

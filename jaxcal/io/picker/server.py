@@ -179,8 +179,7 @@ class _Handler(BaseHTTPRequestHandler):
         except ValueError:
             length = -1
         if not 0 <= length <= _LARGEST_BODY:
-            self.close_connection = True
-            self._refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
+            self.send_error(HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
             return
         body = self.rfile.read(length)
         try:
@@ -217,14 +216,12 @@ class _Handler(BaseHTTPRequestHandler):
         rest = self.page.may(self.path)
         hosts = self.headers.get_all("Host") or []
         if len(hosts) != 1 or hosts[0] not in names or rest is None:
-            self.close_connection = True
-            self._refuse(HTTPStatus.NOT_FOUND)
-            return None
-        if origin is not None and origin not in [f"http://{name}" for name in names]:
-            self.close_connection = True
-            self._refuse(HTTPStatus.FORBIDDEN)
-            return None
-        return rest
+            self.send_error(HTTPStatus.NOT_FOUND)
+        elif origin is not None and origin not in [f"http://{name}" for name in names]:
+            self.send_error(HTTPStatus.FORBIDDEN)
+        else:
+            return rest
+        return None
 
     def _json(self, content: dict[str, Any], status: HTTPStatus = HTTPStatus.OK) -> None:
         self._answer(json.dumps(content, allow_nan=False).encode(), "application/json", status)
@@ -245,7 +242,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.wfile.write(content)
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
-        """Refuse a malformed request without the library's own error page."""
+        """Refuse a request without the library's own error page, and close the connection."""
         self.close_connection = True
         self._refuse(HTTPStatus(code))
 
