@@ -343,28 +343,33 @@ def _localise_one(
     # The brightest of N speckles exceeds t with probability of about N exp(-t^2 / 2 sigma^2).
     cell = np.prod([max(np.sqrt(2 * np.pi) * size, 1.0) for size in speckle.size])
     needed = decibel(np.sqrt(np.log(max(envelope.size / cell, 1.0) / false_alarm)))
-    if contrast < needed:
-        raise NotFoundError(
-            f"nothing stands out: the brightest spot is {contrast:.1f} dB over the background, "
-            f"speckle alone reaches {needed:.1f} dB",
-            contrast,
-            margin,
-        )
-    if margin < minimum_margin_db:
-        raise NotFoundError(
-            f"ambiguous, several bright spots: the next is only {margin:.1f} dB below",
-            contrast,
-            margin,
-        )
-    if shape.sum() < 3:
-        raise NotFoundError("a single bright pixel, not a spot", contrast, margin)
-    rows, columns = np.nonzero(shape)
-    high, wide = envelope.shape
-    if rows.min() == 0 or columns.min() == 0 or rows.max() == high - 1 or columns.max() == wide - 1:
-        raise NotFoundError("the bright spot is cut off by the border", contrast, margin)
-    if extent[0] > LARGEST_SPOT * high or extent[1] > LARGEST_SPOT * wide:
-        raise NotFoundError("the bright area is a structure, not a spot", contrast, margin)
-    spot = fit_spot(envelope, saturated, shape, extent, speckle, target, contrast, margin)
-    if expected is not None and np.linalg.norm(spot.position - expected) > radius:
-        raise NotFoundError("the spot lies farther from the expected place", contrast, margin)
+    try:
+        if contrast < needed:
+            raise NotFoundError(
+                f"nothing stands out: the brightest spot is {contrast:.1f} dB over the background, "
+                f"speckle alone reaches {needed:.1f} dB"
+            )
+        if margin < minimum_margin_db:
+            raise NotFoundError(
+                f"ambiguous, several bright spots: the next is only {margin:.1f} dB below"
+            )
+        _check_shape(shape, extent)
+        spot = fit_spot(envelope, saturated, shape, extent, speckle, target, margin)
+        if expected is not None and np.linalg.norm(spot.position - expected) > radius:
+            raise NotFoundError("the spot lies farther from the expected place")
+    except NotFoundError as reason:
+        reason.contrast_db, reason.margin_db = contrast, margin
+        raise
     return spot
+
+
+def _check_shape(shape: np.ndarray, extent: tuple[float, float]) -> None:
+    """Refuse what is no spot, by its pixels above half the maximum and its SDs along v and u."""
+    if shape.sum() < 3:
+        raise NotFoundError("a single bright pixel, not a spot")
+    border = np.ones_like(shape)
+    border[1:-1, 1:-1] = False
+    if (shape & border).any():
+        raise NotFoundError("the bright spot is cut off by the border")
+    if (np.array(extent) > LARGEST_SPOT * np.array(shape.shape)).any():
+        raise NotFoundError("the bright area is a structure, not a spot")

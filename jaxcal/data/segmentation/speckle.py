@@ -38,9 +38,7 @@ _SPECKLE_SAMPLE = 512
 class NotFoundError(Exception):
     """Why a frame has no credible target, with what was measured of it."""
 
-    def __init__(self, reason: str, contrast_db: float = np.nan, margin_db: float = np.nan):
-        super().__init__(reason)
-        self.contrast_db, self.margin_db = contrast_db, margin_db
+    contrast_db = margin_db = np.nan
 
 
 @dataclass(frozen=True)
