@@ -274,11 +274,8 @@ def tre_at(calibration: Calibration, points: Float[np.ndarray, "*points 2"]) -> 
     """
     points = _image_points(points)
     covariance = np.asarray(error_covariance(calibration.numpy(), points.reshape(-1, 2)))
-    left = np.asarray(degrees_of_freedom(calibration), float)[..., None]
-    factor = np.asarray(variance_factor(calibration))[..., None]
-    found = _errors(covariance, np.broadcast_to(left, covariance.shape[:-2]), factor)
-    shape = (*covariance.shape[:-3], *points.shape[:-1])
-    return TargetError(*(value.reshape(shape) for value in found))
+    batch = covariance.shape[:-3]
+    return _errors(calibration, covariance.reshape(*batch, *points.shape[:-1], 3, 3))
 
 
 def tre_over(calibration: Calibration, points: Float[np.ndarray, "m 2"]) -> TargetError:
@@ -299,29 +296,26 @@ def tre_over(calibration: Calibration, points: Float[np.ndarray, "m 2"]) -> Targ
     values, vectors = np.linalg.eigh(weight)
     root = vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]
     spread = np.swapaxes(root, -1, -2) @ covariance @ root
-    left = np.asarray(degrees_of_freedom(calibration), float)
-    factor = np.asarray(variance_factor(calibration))
-    return TargetError(*_errors(spread, np.broadcast_to(left, spread.shape[:-2]), factor))
+    return _errors(calibration, spread)
 
 
-def _errors(
-    covariance: Float[np.ndarray, "*shape k k"],
-    left: Float[np.ndarray, "*shape"],
-    factor: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Root mean square and interval of the length of a vector with Student's distribution."""
+def _errors(calibration: Calibration, covariance: Float[np.ndarray, "*shape k k"]) -> TargetError:
+    """Of vectors with Student's distribution and these covariances; a batch's axes come first."""
     finite = np.asarray(np.isfinite(covariance).all(axis=(-1, -2)))
     spread = np.where(finite[..., None, None], covariance, np.eye(covariance.shape[-1]))
     values = np.maximum(np.linalg.eigvalsh(spread), 0.0)
-    flat, freedom = values.reshape(-1, values.shape[-1]), left.reshape(-1)
-    lower, upper = np.empty(len(flat)), np.empty(len(flat))
-    for each in np.unique(freedom):
-        rows = np.asarray(freedom == each)
+    batch = np.shape(calibration.status_code)
+    alike = (*batch, *[1] * (finite.ndim - len(batch)))
+    factor = np.asarray(variance_factor(calibration)).reshape(alike)
+    left = np.asarray(degrees_of_freedom(calibration), float).reshape(alike)
+    left = np.broadcast_to(left, finite.shape)
+    lower, upper = np.full(finite.shape, np.nan), np.full(finite.shape, np.nan)
+    for each in np.unique(left[finite]):
+        rows = finite & (left == each)
         for chance, out in ((0.5 - 0.5 * LEVEL, lower), (0.5 + 0.5 * LEVEL, upper)):
-            out[rows] = length_quantile(flat[rows], float(each), chance)
-    rms = np.sqrt(factor * values.sum(axis=-1))
-    found = rms, lower.reshape(left.shape), upper.reshape(left.shape)
-    return tuple(np.where(finite, value, np.nan) for value in found)  # pyright: ignore[reportReturnType]
+            out[rows] = length_quantile(values[rows], float(each), chance)
+    rms = np.where(finite, np.sqrt(factor * values.sum(axis=-1)), np.nan)
+    return TargetError(rms, lower, upper)
 
 
 def length_quantile(
