@@ -51,15 +51,13 @@ class DistanceFit(eqx.Module):
     Attributes:
         position: [lateral, axial] mm (linear array: [lateral, range]), or
             [lateral, axial, elevation squared] in mm, mm and mm^2.
-        covariance: of the position, from the frame's own noise.
-        inverse_normal: the covariance for a distance of unit variance.
+        inverse_normal: the position's covariance for a distance of unit variance.
         noise: SD of one distance, mm, from the residuals.
         lines: elements that answered.
         rejected: of these, how many were given no weight.
     """
 
     position: Float[Array, "*batch p"]
-    covariance: Float[Array, "*batch p p"]
     inverse_normal: Float[Array, "*batch p p"]
     noise: Float[Array, "*batch"]
     lines: Float[Array, "*batch"]
@@ -216,7 +214,7 @@ def _iterate(
     steps: int,
     out_of_plane: bool,
 ) -> DistanceFit:
-    """Gauss-Newton from a start; the last pass also gives the covariance."""
+    """Gauss-Newton from a start; the last pass also gives the inverse normal matrix."""
     unknowns = 3 if out_of_plane else 2
 
     def derivatives(at: _Values) -> tuple[tuple[Array, ...], Array]:
@@ -294,7 +292,6 @@ def _iterate(
     )
     return DistanceFit(
         position=position,
-        covariance=matrix * (noise**2)[..., None, None],
         inverse_normal=matrix,
         noise=noise,
         lines=lines,
