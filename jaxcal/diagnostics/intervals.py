@@ -60,6 +60,9 @@ are equal."""
 
 _RADII = 4000
 """Number of values of rho^2 between which its distribution is interpolated."""
+_FIRST, _LAST = np.log(1e-9), np.log(1e9)
+"""Logarithms of the least and the largest of these values, which are evenly spaced."""
+_SPACING = (_LAST - _FIRST) / (_RADII - 1)
 _AT_ONCE = 32
 """Vectors whose quantiles are computed together."""
 _SPARSE = 16
@@ -365,7 +368,7 @@ def _solve(
         near: a step shorter than this is the last; the error is of the order of its square.
     """
     at = start
-    low, high = np.full(len(at), radial.first), np.full(len(at), radial.last)
+    low, high = np.full(len(at), _FIRST), np.full(len(at), _LAST)
     for _ in range(_MOST_STEPS):
         below, slope = radial.mean(at[:, None] - along)
         low, high = np.where(below < chance, at, low), np.where(below < chance, high, at)
@@ -394,51 +397,41 @@ def _directions(dimensions: int) -> Float[np.ndarray, "d k"]:
 
 @dataclass(frozen=True)
 class _Radial:
-    """Probabilities that rho^2 is below values whose logarithms are evenly spaced.
+    """The distribution of rho^2.
 
     Attributes:
-        first: the least logarithm.
-        last: the largest.
-        below: the probabilities.
+        below: probabilities that it is below :data:`_RADII` values.
         rise: from each probability to the next.
     """
 
-    first: float
-    last: float
     below: Float[np.ndarray, " r"]
     rise: Float[np.ndarray, " r"]
 
-    @property
-    def spacing(self) -> float:
-        """Distance of two successive logarithms."""
-        return (self.last - self.first) / (len(self.below) - 1)
-
     def quantile(self, chance: float) -> float:
         """The first of the logarithms at which a probability is reached."""
-        return self.first + self.spacing * int(np.searchsorted(self.below, chance))
+        return float(_FIRST + _SPACING * int(np.searchsorted(self.below, chance)))
 
     def mean(
         self, values: Float[np.ndarray, "m d"]
     ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
         """Mean probability, by linear interpolation, and its slope; ``values`` are overwritten."""
-        values -= self.first
-        values *= 1 / self.spacing
+        values -= _FIRST
+        values *= 1 / _SPACING
         np.clip(values, 0.0, len(self.below) - 1, out=values)
         left = values.astype(np.intp)
         values -= left
         rise = self.rise.take(left)
         values *= rise
         values += self.below.take(left)
-        return values.mean(axis=1), rise.mean(axis=1) / self.spacing
+        return values.mean(axis=1), rise.mean(axis=1) / _SPACING
 
 
 @cache
 def _radial(dimensions: int, freedom: float) -> _Radial:
     """The distribution of rho^2."""
-    first, last = np.log(1e-9), np.log(1e9)
-    square = np.exp(np.linspace(first, last, _RADII))
+    square = np.exp(np.linspace(_FIRST, _LAST, _RADII))
     if np.isfinite(freedom):
         below = special.fdtr(dimensions, freedom, square / dimensions)
     else:
         below = special.chdtr(dimensions, square)
-    return _Radial(float(first), float(last), below, np.diff(below, append=below[-1]))
+    return _Radial(below, np.diff(below, append=below[-1]))
