@@ -48,6 +48,10 @@ _HOW = (
 )
 
 
+_ROUNDING = 1e-4
+"""Rotations in 32 bits are orthogonal to this."""
+
+
 def _make_floating(tree: Channels | Problem) -> None:
     """Booleans and whole numbers become floats: a mask given to dataclasses.replace, say."""
     for name, value in vars(tree).items():
@@ -449,6 +453,14 @@ def check_shapes(problem: Problem) -> None:
             )
 
 
+def _are_rigid(poses: Float[np.ndarray, "n 4 4"]) -> bool:
+    """Whether poses are rigid but for rounding, as all are that were not put in by ``replace``."""
+    turns = poses[:, :3, :3]
+    away = np.abs(turns @ np.swapaxes(turns, 1, 2) - np.eye(3))
+    last = (poses[:, 3] == [0.0, 0.0, 0.0, 1.0]).all() and np.isfinite(poses).all()
+    return bool(last and (away < _ROUNDING).all() and (np.linalg.det(turns) > 0).all())
+
+
 def check_values(problem: Problem) -> None:
     """Refuse NaN, Inf and too few images, if the values are concrete.
 
@@ -466,7 +478,9 @@ def check_values(problem: Problem) -> None:
     if used.sum() < MINIMUM_IMAGES:
         few = counted(int(used.sum()), "used image", "is", "are")
         raise InputError(f"{few} too few: at least {MINIMUM_IMAGES} are needed")
-    check_poses(np.asarray(problem.poses), used)
+    poses = np.asarray(problem.poses)
+    if not _are_rigid(poses[used]):
+        check_poses(poses, used)  # says which is not, and why
     bad = ~np.isfinite(np.asarray(problem.measurements)).all(axis=1) & used
     if bad.any():
         raise InputError(f"measurements of image {np.flatnonzero(bad)[0]} hold NaN or Inf")
