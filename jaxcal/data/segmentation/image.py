@@ -141,26 +141,27 @@ def localise(
     if scatter.shape not in ((), (2,)) or not (np.isfinite(scatter) & (scatter >= 0)).all():
         raise InputError(f"target_sd_px must be one or two numbers >= 0, not {target_sd_px!r}")
     corner = np.array([first_column, first_row], dtype=float)
-    results: list[Spot | NotFoundError] = []
+    how = (compression, decibels_per_level, false_alarm, minimum_margin_db)
+    spots = []
     for index, frame in enumerate(stack):
         part = frame[first_row : first_row + rows, first_column : first_column + columns]
         centre = None if expected is None else expected[index] - corner
-        try:
-            results.append(
-                _localise_one(
-                    part,
-                    target,
-                    centre,
-                    radius,
-                    compression,
-                    decibels_per_level,
-                    false_alarm,
-                    minimum_margin_db,
-                )
-            )
-        except NotFoundError as reason:
-            results.append(reason)
-    return _collect(results, corner, np.diag(np.broadcast_to(scatter**2, (2,))))
+        spots.append(_localise_one(part, target, centre, radius, *how))
+
+    def stacked(name: str, *shape: int) -> np.ndarray:
+        values = np.array([getattr(spot, name) for spot in spots], dtype=float)
+        return values.reshape(-1, *shape)
+
+    return Localisation(
+        position=stacked("position", 2) + corner,
+        covariance=stacked("covariance", 2, 2) + np.diag(np.broadcast_to(scatter**2, (2,))),
+        found=np.array([not spot.reason for spot in spots], dtype=bool),
+        contrast_db=stacked("contrast_db"),
+        margin_db=stacked("margin_db"),
+        residual=stacked("residual"),
+        width=stacked("width", 2),
+        reason=tuple(spot.reason for spot in spots),
+    )
 
 
 def images_from_frames(
@@ -290,31 +291,6 @@ def _check_near(
     return np.broadcast_to(values, (count, 2)), float(within_px)
 
 
-def _collect(
-    results: list[Spot | NotFoundError], corner: np.ndarray, scatter: np.ndarray
-) -> Localisation:
-    count = len(results)
-    position, covariance = np.full((count, 2), np.nan), np.full((count, 2, 2), np.nan)
-    width, residual = np.full((count, 2), np.nan), np.full(count, np.nan)
-    found = np.zeros(count, bool)
-    for index, result in enumerate(results):
-        if isinstance(result, Spot):
-            found[index] = True
-            position[index] = result.position + corner
-            covariance[index] = result.covariance + scatter
-            width[index], residual[index] = result.width, result.residual
-    return Localisation(
-        position=position,
-        covariance=covariance,
-        found=found,
-        contrast_db=np.array([result.contrast_db for result in results], dtype=float),
-        margin_db=np.array([result.margin_db for result in results], dtype=float),
-        residual=residual,
-        width=width,
-        reason=tuple(str(r) if isinstance(r, NotFoundError) else "" for r in results),
-    )
-
-
 def _localise_one(
     frame: np.ndarray,
     target: Target,
@@ -325,25 +301,25 @@ def _localise_one(
     false_alarm: float,
     minimum_margin_db: float,
 ) -> Spot:
-    """The target in one region; positions relative to the region's first pixel."""
+    """The target in one region, or why there is none; positions count from its first pixel."""
+    contrast = margin = np.nan
     values = frame.astype(np.float64)
-    if not np.isfinite(values).all():
-        raise NotFoundError("the frame holds NaN or Inf")
-    if np.ptp(values) == 0:
-        raise NotFoundError("the frame is constant")
-    envelope = envelope_of(values, frame.dtype, compression, decibels_per_level)
-    saturated = saturated_pixels(values)
-    peak, rival = brightest(envelope, expected, radius)
-    shape, extent = half_maximum(envelope, peak)
-    keep_out = [int(np.ceil(4 * sd)) + 1 for sd in extent]
-    speckle = background(envelope, peak, keep_out)
-    rms = np.sqrt(2.0) * speckle.sigma
-    contrast = decibel(envelope[peak] / rms)
-    margin = decibel(envelope[peak] / max(rival(keep_out), rms))
-    # The brightest of N speckles exceeds t with probability of about N exp(-t^2 / 2 sigma^2).
-    cell = np.prod([max(np.sqrt(2 * np.pi) * size, 1.0) for size in speckle.size])
-    needed = decibel(np.sqrt(np.log(max(envelope.size / cell, 1.0) / false_alarm)))
     try:
+        if not np.isfinite(values).all():
+            raise NotFoundError("the frame holds NaN or Inf")
+        if np.ptp(values) == 0:
+            raise NotFoundError("the frame is constant")
+        envelope = envelope_of(values, frame.dtype, compression, decibels_per_level)
+        peak, rival = brightest(envelope, expected, radius)
+        shape, extent = half_maximum(envelope, peak)
+        keep_out = [int(np.ceil(4 * sd)) + 1 for sd in extent]
+        speckle = background(envelope, peak, keep_out)
+        rms = np.sqrt(2.0) * speckle.sigma
+        contrast = decibel(envelope[peak] / rms)
+        margin = decibel(envelope[peak] / max(rival(keep_out), rms))
+        # The brightest of N speckles exceeds t with probability of about N exp(-t^2 / 2 sigma^2).
+        cell = np.prod([max(np.sqrt(2 * np.pi) * size, 1.0) for size in speckle.size])
+        needed = decibel(np.sqrt(np.log(max(envelope.size / cell, 1.0) / false_alarm)))
         if contrast < needed:
             raise NotFoundError(
                 f"nothing stands out: the brightest spot is {contrast:.1f} dB over the background, "
@@ -354,12 +330,11 @@ def _localise_one(
                 f"ambiguous, several bright spots: the next is only {margin:.1f} dB below"
             )
         _check_shape(shape, extent)
-        spot = fit_spot(envelope, saturated, shape, extent, speckle, target, margin)
+        spot = fit_spot(envelope, saturated_pixels(values), shape, extent, speckle, target, margin)
         if expected is not None and np.linalg.norm(spot.position - expected) > radius:
             raise NotFoundError("the spot lies farther from the expected place")
     except NotFoundError as reason:
-        reason.contrast_db, reason.margin_db = contrast, margin
-        raise
+        return Spot(contrast_db=contrast, margin_db=margin, reason=str(reason))
     return spot
 
 

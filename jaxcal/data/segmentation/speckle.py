@@ -36,9 +36,7 @@ _SPECKLE_SAMPLE = 512
 
 
 class NotFoundError(Exception):
-    """Why a frame has no credible target, with what was measured of it."""
-
-    contrast_db = margin_db = np.nan
+    """Why a frame has no credible target."""
 
 
 @dataclass(frozen=True)

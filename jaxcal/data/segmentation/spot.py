@@ -17,7 +17,7 @@ through the fit: W C W', where C is the noise's covariance and W the pseudo-inve
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -48,23 +48,25 @@ _EXCESS = 2.0
 
 @dataclass(frozen=True)
 class Spot:
-    """A fitted target.
+    """A fitted target, or what was measured of a frame without one; NaN where nothing was.
 
     Attributes:
         position: [u, v], px.
-        covariance: (2, 2), px^2.
+        covariance: px^2.
         contrast_db: envelope over the background's root mean square, dB.
         margin_db: envelope over the next brightest place, dB.
         residual: root mean square of the fit's residual over the target's envelope.
         width: SDs along u and v, px.
+        reason: why there is no target; empty where there is one.
     """
 
-    position: np.ndarray
-    covariance: np.ndarray
-    contrast_db: float
-    margin_db: float
-    residual: float
-    width: np.ndarray
+    position: Float[np.ndarray, " 2"] = field(default_factory=lambda: np.full(2, np.nan))
+    covariance: Float[np.ndarray, "2 2"] = field(default_factory=lambda: np.full((2, 2), np.nan))
+    contrast_db: float = np.nan
+    margin_db: float = np.nan
+    residual: float = np.nan
+    width: Float[np.ndarray, " 2"] = field(default_factory=lambda: np.full(2, np.nan))
+    reason: str = ""
 
 
 def saturated_pixels(values: np.ndarray) -> Bool[np.ndarray, "rows columns"]:
