@@ -221,7 +221,7 @@ def test_leaving_out_is_foretold_where_axes_have_errors_of_their_own_size():
         errors = sizes * rng.normal(size=(9, 3))
         step = -np.linalg.solve(whole, np.einsum("mkp,mk->p", rows, errors))
         seen = influences.WhitenedErrors(errors + rows @ step, rows, np.arange(3), np.zeros(9),
-                                         np.ones(9, bool), 9, sizes**2)  # fmt: skip
+                                         np.ones(9, bool), sizes**2)  # fmt: skip
         found = influences._influence(seen, np.zeros(4), np.zeros(4))
         squares.append(np.sum(found.moved**2, axis=1))
         chances.append(found.log_density.sum())
@@ -334,7 +334,7 @@ def test_predicting_an_image_from_the_others_is_what_bayes_says():
 
     step = np.linalg.lstsq(rows.reshape(-1, 4), -errors.reshape(-1), rcond=None)[0]
     seen = influences.WhitenedErrors(errors + rows @ step, rows, np.arange(3), np.zeros(9),
-                                     np.ones(9, bool), 9, np.ones(3))  # fmt: skip
+                                     np.ones(9, bool), np.ones(3))  # fmt: skip
     found = influences._influence(seen, np.zeros(4), np.zeros(4))
     for image in range(9):
         others = np.arange(9) != image
@@ -371,7 +371,7 @@ def test_residuals_that_keep_to_the_model_do_not_contradict_it():
             step = np.linalg.solve(whole, np.einsum("mkp,mk->p", loud, size * errors))
             ones = np.ones(40)
             seen = influences.WhitenedErrors(size * errors - loud @ step, loud, np.arange(3),
-                                             0 * ones, ones > 0, 40, np.ones(3))  # fmt: skip
+                                             0 * ones, ones > 0, np.ones(3))  # fmt: skip
             ratio, chance = excess(influences._influence(seen, np.zeros(5), np.zeros(5)), weight)
             out.append(ratio)
             if factor == 1.0:
@@ -394,7 +394,7 @@ def test_a_prior_holds_an_answer_as_images_do():
         errors = rng.normal(size=(40, 3)) - rows @ believed
         away = -np.linalg.solve(whole, np.einsum("mkp,mk->p", rows, errors))
         seen = influences.WhitenedErrors(errors + rows @ away, rows, np.arange(3), np.zeros(40),
-                                         np.ones(40, bool), 40, np.ones(3))  # fmt: skip
+                                         np.ones(40, bool), np.ones(3))  # fmt: skip
         found = influences._influence(seen, precision, away)
         ratios.append(excess(found, weight)[0])
     assert np.mean(ratios) == pytest.approx(1.0, abs=0.05)

@@ -188,7 +188,7 @@ def test_correlation_time(frames, alike):
 def whitened(errors: np.ndarray, rows: np.ndarray) -> WhitenedErrors:
     """Lateral, range and elevational errors in their own SDs."""
     every = np.ones(len(rows))
-    return WhitenedErrors(errors, rows, np.arange(3), 0 * every, every > 0, len(rows), np.ones(3))
+    return WhitenedErrors(errors, rows, np.arange(3), 0 * every, every > 0, np.ones(3))
 
 
 def _linear_answers(order, correlation: float, share: float = 1.0):

@@ -236,7 +236,7 @@ def test_any_leading_axes_and_transformations():
     mapped = jax.jit(jax.vmap(lambda d: fit_in_plane(d, positions, robust=True)))(
         jnp.asarray(distances)
     )
-    assert nested.covariance.shape == (3, 4, 2, 2)
+    assert nested.inverse_normal.shape == (3, 4, 2, 2)
     np.testing.assert_allclose(nested.position.reshape(12, 2), flat.position, atol=1e-11)
     np.testing.assert_allclose(mapped.position, flat.position, atol=1e-11)
     lone = fit(distances[0], positions, robust=True)

@@ -181,33 +181,28 @@ def rotations_from_quaternions(
         name = row if labels is None else labels[row]
         raise InputError(f"quaternion {name} has length {length[row]:g}, not 1")
     values = values / length[:, None]
-    w, x, y, z = (values if order == "wxyz" else values[:, [3, 0, 1, 2]]).T
-    return np.stack(
-        [
-            1 - 2 * (y * y + z * z),
-            2 * (x * y - w * z),
-            2 * (x * z + w * y),
-            2 * (x * y + w * z),
-            1 - 2 * (x * x + z * z),
-            2 * (y * z - w * x),
-            2 * (x * z - w * y),
-            2 * (y * z + w * x),
-            1 - 2 * (x * x + y * y),
-        ],
-        axis=-1,
-    ).reshape(-1, 3, 3)
+    scalar, vector = values[:, 3], values[:, :3]
+    if order == "wxyz":
+        scalar, vector = values[:, 0], values[:, 1:]
+    cross = _cross(vector)
+    return np.eye(3) + 2 * (scalar[:, None, None] * cross + cross @ cross)
 
 
 def rotations_from_vectors(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
     """Rotation matrices of axes times angles (rad), by Rodrigues' formula."""
     angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
-    x, y, z = np.moveaxis(vectors, -1, 0)
-    zero = np.zeros_like(x)
-    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1)
-    cross = cross.reshape(*vectors.shape, 3)
+    cross = _cross(vectors)
     # sin(t) / t and (1 - cos(t)) / t^2 by numpy's sinc, which is right at zero.
     first, second = np.sinc(angle / np.pi), 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
     return np.eye(3) + first * cross + second * cross @ cross
+
+
+def _cross(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
+    """The matrices [v]x of cross products with vectors."""
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    zero = np.zeros_like(x)
+    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1)
+    return cross.reshape(*vectors.shape, 3)
 
 
 def quaternions_from_rotations(rotations: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n 4"]:

@@ -24,7 +24,10 @@ _LONGEST_DELAY_S = 1e-3
 
 
 class _Array:
-    """What every transducer array has; the attributes are documented in the public classes."""
+    """A straight array; the attributes are documented in the public classes.
+
+    A curved one overrides how places along it and ranges become places in the image plane.
+    """
 
     elements: int
     pitch_mm: float
@@ -44,10 +47,6 @@ class _Array:
             raise InputError(
                 f"probe delay must be in s, less than a millisecond, not {self.delay_s}"
             )
-
-    def _along(self) -> Float[np.ndarray, " elements"]:
-        """Where the elements are along the array, mm from its middle."""
-        return (np.arange(self.elements) - (self.elements - 1) / 2) * self.pitch_mm
 
     @property
     def width_mm(self) -> float:
@@ -72,13 +71,60 @@ class _Array:
         """One-way times of flight (s) over distances (mm), the electronics' delay included."""
         return real_array(distances_mm, "distances") / (1e3 * self.sound_speed_m_s) + self.delay_s
 
+    def element_positions(self) -> Float[np.ndarray, "elements 3"]:
+        """Every element's [lateral, elevational, axial], mm (e of Eqs. 5 and 6)."""
+        return np.insert(self.image_to_cartesian(np.arange(self.elements), 0.0), 1, 0.0, axis=1)
+
+    def element_lateral(self) -> Float[np.ndarray, " elements"]:
+        """Lateral position of every element, mm."""
+        return self.element_positions()[:, 0]
+
+    def contains(
+        self, points: Num[np.ndarray, "*batch d"], depth_mm: float
+    ) -> Bool[np.ndarray, "*batch"]:
+        """Whether points lie in front of the aperture, no deeper than ``depth_mm``.
+
+        Args:
+            points: [lateral, axial] or [lateral, elevational, axial], mm; elevation is ignored.
+            depth_mm: deepest range from the array, mm.
+        """
+        along, depth = self._along_and_range(points)
+        inside = (np.abs(along) <= self.width_mm / 2) & (depth > 0) & (depth <= depth_mm)
+        return np.asarray(inside)
+
+    def image_to_cartesian(
+        self, line: Num[np.ndarray, "*#batch"] | float, range_mm: Num[np.ndarray, "*#batch"] | float
+    ) -> Float[np.ndarray, "*batch 2"]:
+        """[lateral, axial] (mm) on scan line ``line`` (element number) at ``range_mm`` (Eq. 3)."""
+        along = (real_array(line, "line") - (self.elements - 1) / 2) * self.pitch_mm
+        return self._place(along, real_array(range_mm, "range_mm"))
+
+    def cartesian_to_image(
+        self, points: Num[np.ndarray, "*batch d"]
+    ) -> tuple[Float[np.ndarray, "*batch"], Float[np.ndarray, "*batch"]]:
+        """Scan line (element number) and range from the array (mm) of places in the image plane."""
+        along, depth = self._along_and_range(points)
+        return along / self.pitch_mm + (self.elements - 1) / 2, depth
+
+    def _place(
+        self, along: Float[np.ndarray, "*#batch"], range_mm: Float[np.ndarray, "*#batch"]
+    ) -> Float[np.ndarray, "*batch 2"]:
+        """[lateral, axial], mm, of places along the array (mm from its middle) at a range."""
+        return np.stack(np.broadcast_arrays(along, range_mm), axis=-1)
+
+    def _along_and_range(
+        self, points: Num[np.ndarray, "*batch d"]
+    ) -> tuple[Float[np.ndarray, "*batch"], Float[np.ndarray, "*batch"]]:
+        """The inverse of :meth:`_place`."""
+        return _in_plane(points)
+
 
 def _in_plane(points) -> tuple[np.ndarray, np.ndarray]:
     """Lateral and axial of points with two or three coordinates."""
     points = real_array(points, "points")
     if points.ndim == 0 or points.shape[-1] not in (2, 3):
         raise InputError(f"points need 2 or 3 coordinates, their shape is {points.shape}")
-    return points[..., 0], points[..., -1]
+    return np.asarray(points[..., 0]), np.asarray(points[..., -1])
 
 
 @dataclass(frozen=True)
@@ -98,43 +144,6 @@ class LinearProbe(_Array):
     sound_speed_m_s: float = 1490.0
     delay_s: float = 0.0
     kind: ClassVar[Literal["linear"]] = "linear"
-
-    def element_lateral(self) -> Float[np.ndarray, " elements"]:
-        """Lateral position of every element, mm (Eq. 5's e_x; e_y = e_z = 0)."""
-        return self._along()
-
-    def element_positions(self) -> Float[np.ndarray, "elements 3"]:
-        """Every element's [lateral, elevational, axial], mm."""
-        zero = np.zeros(self.elements)
-        return np.stack([self._along(), zero, zero], axis=-1)
-
-    def contains(
-        self, points: Num[np.ndarray, "*batch d"], depth_mm: float
-    ) -> Bool[np.ndarray, "*batch"]:
-        """Whether points lie under the array, in front of it and no deeper than ``depth_mm``.
-
-        Args:
-            points: [lateral, axial] or [lateral, elevational, axial], mm; elevation is ignored.
-            depth_mm: deepest range from the array, mm.
-        """
-        lateral, axial = _in_plane(points)
-        inside = (np.abs(lateral) <= self.width_mm / 2) & (axial > 0) & (axial <= depth_mm)
-        return np.asarray(inside)
-
-    def image_to_cartesian(
-        self, line: Num[np.ndarray, "*#batch"] | float, range_mm: Num[np.ndarray, "*#batch"] | float
-    ) -> Float[np.ndarray, "*batch 2"]:
-        """[lateral, axial] (mm) on scan line ``line`` (element number) at ``range_mm`` (Eq. 3)."""
-        lateral = (real_array(line, "line") - (self.elements - 1) / 2) * self.pitch_mm
-        lateral, axial = np.broadcast_arrays(lateral, real_array(range_mm, "range_mm"))
-        return np.stack([lateral, axial], axis=-1)
-
-    def cartesian_to_image(
-        self, points: Num[np.ndarray, "*batch d"]
-    ) -> tuple[Float[np.ndarray, "*batch"], Float[np.ndarray, "*batch"]]:
-        """Scan line (element number) and range (mm) of places in the image plane."""
-        lateral, axial = _in_plane(points)
-        return lateral / self.pitch_mm + (self.elements - 1) / 2, axial
 
 
 @dataclass(frozen=True)
@@ -176,17 +185,7 @@ class CurvilinearProbe(_Array):
 
     def element_angle(self) -> Float[np.ndarray, " elements"]:
         """Angle of every element about the arc's centre, rad from the axis."""
-        return self._along() / self.radius_mm
-
-    def element_positions(self) -> Float[np.ndarray, "elements 3"]:
-        """Every element's [lateral, elevational, axial], mm (Eq. 6's e)."""
-        angle = self.element_angle()
-        axial = -2.0 * self.radius_mm * np.sin(angle / 2) ** 2
-        return np.stack([self.radius_mm * np.sin(angle), np.zeros_like(angle), axial], axis=-1)
-
-    def element_lateral(self) -> Float[np.ndarray, " elements"]:
-        """Lateral position of every element, mm."""
-        return self.element_positions()[:, 0]
+        return self.polar(self.element_positions())[0]
 
     def polar(
         self, points: Num[np.ndarray, "*batch d"]
@@ -196,19 +195,6 @@ class CurvilinearProbe(_Array):
         behind = axial + self.radius_mm
         depth = np.hypot(lateral, behind) - self.radius_mm
         return np.asarray(np.arctan2(lateral, behind)), np.asarray(depth)
-
-    def contains(
-        self, points: Num[np.ndarray, "*batch d"], depth_mm: float
-    ) -> Bool[np.ndarray, "*batch"]:
-        """Whether points lie in the sector in front of the arc, no deeper than ``depth_mm``.
-
-        Args:
-            points: [lateral, axial] or [lateral, elevational, axial], mm; elevation is ignored.
-            depth_mm: deepest range from the arc, mm.
-        """
-        angle, depth = self.polar(points)
-        inside = (np.abs(angle) <= self.half_angle_rad) & (depth > 0) & (depth <= depth_mm)
-        return np.asarray(inside)
 
     def polar_to_cartesian(
         self,
@@ -222,20 +208,16 @@ class CurvilinearProbe(_Array):
         axial = depth * np.cos(angle) - 2.0 * self.radius_mm * np.sin(angle / 2) ** 2
         return np.stack(np.broadcast_arrays(lateral, axial), axis=-1)
 
-    def image_to_cartesian(
-        self, line: Num[np.ndarray, "*#batch"] | float, range_mm: Num[np.ndarray, "*#batch"] | float
+    def _place(
+        self, along: Float[np.ndarray, "*#batch"], range_mm: Float[np.ndarray, "*#batch"]
     ) -> Float[np.ndarray, "*batch 2"]:
-        """[lateral, axial] (mm) on scan line ``line`` (element number) at ``range_mm``."""
-        line = real_array(line, "line")
-        angle = (line - (self.elements - 1) / 2) * self.pitch_mm / self.radius_mm
-        return self.polar_to_cartesian(angle, range_mm)
+        return self.polar_to_cartesian(along / self.radius_mm, range_mm)
 
-    def cartesian_to_image(
+    def _along_and_range(
         self, points: Num[np.ndarray, "*batch d"]
     ) -> tuple[Float[np.ndarray, "*batch"], Float[np.ndarray, "*batch"]]:
-        """Scan line (element number) and range from the arc (mm) of places in the image plane."""
         angle, depth = self.polar(points)
-        return angle * self.radius_mm / self.pitch_mm + (self.elements - 1) / 2, depth
+        return np.asarray(angle * self.radius_mm), depth
 
 
 Probe = LinearProbe | CurvilinearProbe
@@ -250,10 +232,10 @@ def check_probe(probe: object) -> None:
         )
 
 
-L14_5 = LinearProbe(elements=128, pitch_mm=58.5 / 128)
+L14_5 = LinearProbe()
 """The paper's 58.5 mm L14-5W linear array (section 3.2)."""
 
-C5_2 = CurvilinearProbe(elements=128, pitch_mm=float(np.radians(60.0)) * 60.0 / 128, radius_mm=60.0)
+C5_2 = CurvilinearProbe()
 """An abdominal convex array of the C5-2 kind: 128 elements over 60 degrees at 60 mm."""
 
 PRESETS: dict[str, Probe] = {"linear": L14_5, "curvilinear": C5_2}

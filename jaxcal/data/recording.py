@@ -414,25 +414,22 @@ def used_values(
             row is named.
     """
     if kind == "time_of_flight":
-        # NaN is an element that saw nothing.
-        bad = np.isinf(values).any(axis=1) & used
         values[~used] = np.nan
-    else:
-        values[~used] = 1.0
-        bad = ~np.isfinite(values).all(axis=1)
-    _refuse(kind, bad, "holds NaN or Inf")
-    if kind == "time_of_flight":
+        # NaN is an element that saw nothing.
+        _refuse(kind, np.isinf(values).any(axis=1), "holds NaN or Inf")
         return values
+    values[~used] = 1.0
+    _refuse(kind, ~np.isfinite(values).all(axis=1), "holds NaN or Inf")
     _check_magnitude(kind, values, used)
     if kind == "point":
-        _refuse(kind, (values[:, 1] <= 0) & used, "has a range that is not positive")
-    if kind == "pixel":
-        above = np.flatnonzero((values[:, 1] < 0) & used)
-        if len(above):
-            raise InputError(
-                f"pixel {above[0]} has row v = {values[above[0], 1]:g}: rows count from the top of "
-                "the image, where v = 0; are u and v exchanged, or counted from the image's middle?"
-            )
+        _refuse(kind, values[:, 1] <= 0, "has a range that is not positive")
+        return values
+    above = np.flatnonzero(values[:, 1] < 0)
+    if len(above):
+        raise InputError(
+            f"pixel {above[0]} has row v = {values[above[0], 1]:g}: rows count from the top of the "
+            "image, where v = 0; are u and v exchanged, or counted from the image's middle?"
+        )
     return values
 
 

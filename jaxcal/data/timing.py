@@ -18,7 +18,7 @@ import numpy as np
 from jaxcal import InputError
 from jaxcal.data.poses import check_poses
 from jaxcal.runtime.array_types import Bool, Float
-from jaxcal.runtime.given_values import is_number, real_array
+from jaxcal.runtime.given_values import real_array
 from jaxcal.runtime.messages import seconds
 
 MINIMUM_MOTION_MM = 8.0
@@ -27,13 +27,16 @@ MINIMUM_MOTION_MM = 8.0
 LEVER_MM = 100.0
 """The lever, from the tracked origin: about the distance of a target from the probe's marker."""
 
+LARGEST_LAG_S = 0.5
+"""Largest lag looked for, in both directions."""
+
+_LAG_STEP_S = 1e-3
 _SHORTEST_OVERLAP_S = 1.0
 _RIVAL = 0.98
 _MINIMUM_CORRELATION = 0.8
-_MOST_STEPS = 1_000_000
 _COARSEST_S = 1e-3
 """A clock's times, as seconds, have digits for at least a millisecond."""
-_PARABOLA_S = 0.005
+_PARABOLA_STEPS = 5
 
 
 def _increasing(t: np.ndarray, what: str, minimum: int = 2) -> Float[np.ndarray, " n"]:
@@ -284,14 +287,7 @@ class Latency:
 
 
 def estimate_latency(
-    t_video: np.ndarray,
-    video: np.ndarray,
-    t_tracker: np.ndarray,
-    tracker_mm: np.ndarray,
-    *,
-    max_lag_s: float = 0.5,
-    step_s: float = 0.001,
-    minimum_motion_mm: float = MINIMUM_MOTION_MM,
+    t_video: np.ndarray, video: np.ndarray, t_tracker: np.ndarray, tracker_mm: np.ndarray
 ) -> Latency:
     """Lag of the images behind the poses, from one motion that both show.
 
@@ -306,9 +302,6 @@ def estimate_latency(
         video: (n,) position of something at rest as the images show it, in any unit.
         t_tracker: (m,) stamps of the poses, s.
         tracker_mm: (m,) position of the probe, mm (:func:`motion_along_main_axis`).
-        max_lag_s: largest lag looked for, in both directions.
-        step_s: step of the search.
-        minimum_motion_mm: least span of the tracker's motion.
 
     Raises:
         InputError: too little motion or overlap, signals that do not agree, a best lag at the edge
@@ -322,28 +315,22 @@ def estimate_latency(
         raise InputError("each motion must have one value for each of its times")
     if not (np.isfinite(video).all() and np.isfinite(tracker).all()):
         raise InputError("a motion holds NaN or Inf: leave those samples out")
-    limits = {"max_lag_s": max_lag_s, "step_s": step_s, "minimum_motion_mm": minimum_motion_mm}
-    for name, value in limits.items():
-        if not is_number(value) or value < 0:
-            raise InputError(f"{name} must be a number of at least 0, not {value!r}")
-    if not (0 < step_s <= max_lag_s and max_lag_s / step_s <= _MOST_STEPS):
-        raise InputError(f"the step ({step_s:g} s) must be small against {max_lag_s:g} s")
     # The same images are used at every lag: a lag with fewer images could win by chance.
-    used = (t_video - max_lag_s >= t_tracker[0]) & (t_video + max_lag_s <= t_tracker[-1])
+    used = (t_video - LARGEST_LAG_S >= t_tracker[0]) & (t_video + LARGEST_LAG_S <= t_tracker[-1])
     t, signal = t_video[used], video[used]
     if len(t) < 8 or t[-1] - t[0] < _SHORTEST_OVERLAP_S:
+        needed = _SHORTEST_OVERLAP_S + 2 * LARGEST_LAG_S
         raise InputError(
-            f"images and poses overlap by too little: {_SHORTEST_OVERLAP_S + 2 * max_lag_s:g} s or "
-            "more of both are needed"
+            f"images and poses overlap by too little: {needed:g} s or more of both are needed"
         )
-    during = tracker[(t_tracker >= t[0] - max_lag_s) & (t_tracker <= t[-1] + max_lag_s)]
+    during = tracker[(t_tracker >= t[0] - LARGEST_LAG_S) & (t_tracker <= t[-1] + LARGEST_LAG_S)]
     span = float(np.ptp(during))
-    if span < minimum_motion_mm:
-        raise InputError(f"the probe moved by {span:.3g} mm; {minimum_motion_mm:g} are needed")
+    if span < MINIMUM_MOTION_MM:
+        raise InputError(f"the probe moved by {span:.3g} mm; {MINIMUM_MOTION_MM:g} are needed")
     if np.ptp(signal) == 0:
         raise InputError("the images show no motion")
-    steps = int(np.floor(max_lag_s / step_s + 1e-9))
-    lags = np.arange(-steps, steps + 1) * step_s
+    steps = round(LARGEST_LAG_S / _LAG_STEP_S)
+    lags = np.arange(-steps, steps + 1) * _LAG_STEP_S
     centred = signal - signal.mean()
     centred = centred / np.linalg.norm(centred)
     correlation = np.zeros(len(lags))
@@ -373,13 +360,12 @@ def _peak(lags: np.ndarray, correlation: np.ndarray, samples: int) -> Latency:
                 "probe less regularly"
             )
     # Interpolation between samples makes kinks of the size of a step, so the parabola is wider.
-    step = lags[1] - lags[0]
-    half = max(1, min(round(_PARABOLA_S / step), best, len(lags) - 1 - best))
+    half = min(_PARABOLA_STEPS, best, len(lags) - 1 - best)
     near = slice(best - half, best + half + 1)
     bend, slope, top = np.polyfit(lags[near] - lags[best], strength[near], 2)
     if bend >= 0:
         raise InputError("the correlation has no clear peak: move the probe farther or faster")
-    shift = float(np.clip(-slope / (2 * bend), -half * step, half * step))
+    shift = float(np.clip(-slope / (2 * bend), -half * _LAG_STEP_S, half * _LAG_STEP_S))
     # With unit signals, the lag's variance is that of the misfit, (1 - r^2) / n, divided by the
     # power of the slope, (-r'' / r) r^2.
     top = min(float(top), 1.0)

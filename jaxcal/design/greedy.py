@@ -158,24 +158,25 @@ class Cover:
     """Distances from all parts of the candidates' space to the nearest pose.
 
     Args:
-        features: (m, 5) of the candidates.
+        features: (m, 5) of the candidates (:func:`space_features`).
+        taken: (t, 5) of the images taken already, which are the first poses.
     """
 
     _REFERENCES = 400
 
-    def __init__(self, features: Float[np.ndarray, "m 5"]) -> None:
-        self._references = features[:: max(len(features) // self._REFERENCES, 1)]
-        self._apart = _apart(features, self._references)
-        self._nearest = np.full(len(self._references), np.inf)
+    def __init__(self, features: Float[np.ndarray, "m 5"], taken: Float[np.ndarray, "t 5"]) -> None:
+        references = features[:: max(len(features) // self._REFERENCES, 1)]
+        self._apart = _apart(features, references)
+        self._nearest = _apart(taken, references).min(axis=0, initial=np.inf)
 
     @property
     def begun(self) -> bool:
         """Whether there is a pose already."""
         return bool(np.isfinite(self._nearest[0]))
 
-    def add(self, feature: Float[np.ndarray, " 5"]) -> None:
-        """Add a pose."""
-        self._nearest = np.minimum(self._nearest, _apart(feature[None], self._references)[0])
+    def add(self, row: int) -> None:
+        """Add a candidate to the poses."""
+        self._nearest = np.minimum(self._nearest, self._apart[row])
 
     def filled_by(self, open_to: Bool[np.ndarray, " m"]) -> Bool[np.ndarray, " m"]:
         """Which of the open candidates fill space, at least one."""
@@ -208,51 +209,42 @@ class Chosen:
 
 def choose(
     search: Search,
-    features: Float[np.ndarray, "f 5"],
-    taken_features: Float[np.ndarray, "t 5"],
     count: int,
+    cover: Cover | None = None,
     cost_s: Float[np.ndarray, " m"] | None = None,
 ) -> Chosen:
     """Choose ``count`` candidates one after the other.
 
     Args:
         search: candidates and what is known.
-        features: of the candidates (:func:`space_features`); empty if no pose fills space.
-        taken_features: of the images taken already.
         count: how many.
+        cover: the candidates' space; None if no pose fills it.
         cost_s: seconds that each candidate takes; gains per second are then compared.
     """
-    information = search.known.copy()
-    chosen = Chosen([], [], information)
+    rows, fillings, information = [], [], search.known
     alike = search.counts([])
-    cover = Cover(features) if search.rules.space_filling > 0 else None
-    if cover is not None:
-        for other in taken_features:
-            cover.add(other)
     free = np.ones(len(search.places), bool)
     share = search.rules.space_filling
     for k in range(count):
-        filling = int((k + 1) * share + 1e-9) > int(k * share + 1e-9)
         open_to = free & (alike < search.rules.replicates)
         if not open_to.any():
             # With few candidates, poses that are alike are better than none.
             open_to = free if free.any() else np.ones_like(free)
+        due = int((k + 1) * share + 1e-9) > int(k * share + 1e-9)
+        filling = False
+        if cover is not None and cover.begun and due:
+            open_to, filling = cover.filled_by(open_to), True
         value = search.scores(information)
         value = value if cost_s is None else value / cost_s
-        filling = filling and cover is not None and cover.begun
-        if filling:
-            assert cover is not None
-            open_to = cover.filled_by(open_to)
         row = int(np.argmax(np.where(open_to, value, -np.inf)))
         information = information + search.information_of(row)
         alike += search.alike(search.rotations[row], search.places[row])
         if cover is not None:
-            cover.add(features[row])
+            cover.add(row)
         free[row] = False
-        chosen.rows.append(row)
-        chosen.filling.append(filling)
-    chosen.information = information
-    return chosen
+        rows.append(row)
+        fillings.append(filling)
+    return Chosen(rows, fillings, information)
 
 
 def exchange(search: Search, chosen: Chosen) -> Chosen:

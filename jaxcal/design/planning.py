@@ -19,6 +19,7 @@ from jaxcal.design.criteria import (
 )
 from jaxcal.design.greedy import (
     MOST_POSES,
+    Cover,
     Rules,
     Search,
     choose,
@@ -150,8 +151,11 @@ def plan(
         candidates = _with_taken(candidates, prior)
     candidates = with_effective_noise(prior, candidates)
     search = make_search(candidates, known, criterion, rules)
-    features = space_features(candidates) if rules.space_filling > 0 else np.zeros((0, 5))
-    chosen = choose(search, features, _taken_features(candidates), n, cost_s)
+    cover = None
+    if rules.space_filling > 0:
+        taken = replace(candidates, poses=candidates.taken_and_used)
+        cover = Cover(space_features(candidates), space_features(taken))
+    chosen = choose(search, n, cover, cost_s)
     if swap and cost_s is None:
         chosen = exchange(search, chosen)
     poses = candidates.poses[chosen.rows]
@@ -227,11 +231,8 @@ def known_before(
             "make the candidates with candidates_around(recording, result), or give the images' "
             "poses as their 'taken'"
         )
-    model = with_effective_noise(prior, candidates).model
-    answer = prior.numpy()
-    used = int(np.sum(np.asarray(answer.mask) > 0))
-    information = known_information(prior, model, candidates.taken)
-    return Known(information, used, bool(answer.sigma_tuned))
+    information = known_information(prior, candidates.model, candidates.taken)
+    return Known(information, int(prior.images_used), bool(prior.sigma_tuned))
 
 
 def _checked_information(value: object, size: int) -> Float[np.ndarray, "p p"]:
@@ -286,12 +287,6 @@ def make_search(candidates: Candidates, known: Known, criterion: Criterion, rule
         taken_rotations=(taken[:, :3, :3] @ x).reshape(-1, 9),
         taken_places=model.targets(taken),
     )
-
-
-def _taken_features(candidates: Candidates) -> Float[np.ndarray, "t 5"]:
-    """Space features of the images taken already."""
-    taken = candidates.taken_and_used
-    return space_features(replace(candidates, poses=taken)) if len(taken) else np.zeros((0, 5))
 
 
 def check_candidates(candidates: Candidates) -> None:

@@ -159,7 +159,6 @@ def _recordings(
     """Problems whose poses are off along the elevational axis, with erring measurements."""
     import jax
 
-    from jaxcal.data.problem import Problem
     from jaxcal.study.offsets import standard_deviation, standard_offsets
 
     trials, count = poses.shape[:2]

@@ -94,7 +94,6 @@ class WhitenedErrors:
         kind: index into :data:`KINDS` of each error.
         log_sd: sum of the logarithms of an image's SDs, mm.
         used: which images are in use.
-        images: number of all images.
         variances: v_k of the errors; ones where each is in its own SD.
     """
 
@@ -103,7 +102,6 @@ class WhitenedErrors:
     kind: Int[Array, " k"]
     log_sd: Float[Array, " m"]
     used: Bool[Array, " n"]
-    images: int
     variances: Float[Array, " k"]
 
     def covariances(
@@ -193,7 +191,7 @@ def _influence(
     density = density - 0.5 * components * np.log(2 * np.pi) - found.log_sd
 
     def everywhere(values: Array) -> Array:
-        whole = np.zeros((found.images, *values.shape[1:]))
+        whole = np.zeros((len(found.used), *values.shape[1:]))
         whole[found.used] = values
         return whole
 
@@ -253,7 +251,7 @@ def _from_points(answer: Calibration, seen: ImageErrors, used: Array) -> Whitene
     if tau is not None:
         sigma = np.hypot(sigma, float(tau[0]) * np.array([1.0, 1.0, 0.0]))
     log_sd = log_sd + np.sum(np.log(sigma))
-    return WhitenedErrors(errors, rows, np.arange(3), log_sd, used, len(used), np.ones(3))
+    return WhitenedErrors(errors, rows, np.arange(3), log_sd, used, np.ones(3))
 
 
 def _from_channels(answer: Calibration, seen: ImageErrors, used: Array) -> WhitenedErrors:
@@ -275,7 +273,7 @@ def _from_channels(answer: Calibration, seen: ImageErrors, used: Array) -> White
     # Lateral position and range come from the same elements, whose errors count as range errors.
     kind = np.array([1] * len(elements) + [2])
     log_sd = listened.sum(axis=1) * np.log(element_sd) + np.log(sigma[2])
-    return WhitenedErrors(errors, rows, kind, log_sd, used, len(used), np.ones(len(kind)))
+    return WhitenedErrors(errors, rows, kind, log_sd, used, np.ones(len(kind)))
 
 
 def _equal_weights(
@@ -298,25 +296,12 @@ def _equal_weights(
         errors = errors - along * np.sum(along * errors, axis=1, keepdims=True)
     log_sd = np.full(int(used.sum()), 3 * np.log(sd))
     kind, ones = np.array([0, 2, 1]), np.ones(3)
-    return WhitenedErrors(errors / sd, rows / sd, kind, log_sd, used, len(used), ones)
-
-
-@dataclass(frozen=True)
-class EqualWeights:
-    """The conventional fit of the same images, judged by the noise that was found.
-
-    Attributes:
-        covariance: of the fit's unknowns, if errors have the given covariances.
-        log_density: of every image's three errors as predicted from the others; 0 where not used.
-    """
-
-    covariance: Float[Array, "p p"]
-    log_density: Float[Array, " n"]
+    return WhitenedErrors(errors / sd, rows / sd, kind, log_sd, used, ones)
 
 
 def conventional_fit(
     seen: ImageErrors, used: Bool[Array, " n"], noise: Float[Array, "n 3 3"]
-) -> EqualWeights:
+) -> tuple[Float[Array, "p p"], Float[Array, " n"]]:
     """How good the fit with equal weights is, if errors have other covariances N_i.
 
     Its covariance is A^-1 (sum of R_i' N_i R_i) A^-1 with A = sum of R_i' R_i.
@@ -325,6 +310,10 @@ def conventional_fit(
         seen: the images under the conventional fit (one leading axis of length 1).
         used: images in use.
         noise: covariance of every image's lateral, range and elevational errors, mm^2.
+
+    Returns:
+        The covariance of the fit's unknowns, and the log density of every image's three errors as
+        predicted from the others; 0 where not used.
     """
     zero = np.zeros_like(seen.mask)
     plain = _equal_weights(seen, zero, 1.0, used)
@@ -336,7 +325,7 @@ def conventional_fit(
     kind = scaled.kind
     steps, noise = found.residual_rows[used] / sd, noise[used][:, kind[:, None], kind]
     covariance = np.einsum("nkp,nkl,nlq->pq", steps, noise, steps)
-    return EqualWeights(covariance, found.log_density)
+    return covariance, found.log_density
 
 
 def excess(found: Influence, weight: Float[Array, "p p"]) -> tuple[float, float]:

@@ -60,6 +60,9 @@ are equal."""
 
 _RADII = 4000
 """Number of values of rho^2 between which its distribution is interpolated."""
+_FIRST, _LAST = np.log(1e-9), np.log(1e9)
+"""Logarithms of the least and the largest of these values, which are evenly spaced."""
+_SPACING = (_LAST - _FIRST) / (_RADII - 1)
 _AT_ONCE = 32
 """Vectors whose quantiles are computed together."""
 _SPARSE = 16
@@ -274,11 +277,8 @@ def tre_at(calibration: Calibration, points: Float[np.ndarray, "*points 2"]) -> 
     """
     points = _image_points(points)
     covariance = np.asarray(error_covariance(calibration.numpy(), points.reshape(-1, 2)))
-    left = np.asarray(degrees_of_freedom(calibration), float)[..., None]
-    factor = np.asarray(variance_factor(calibration))[..., None]
-    found = _errors(covariance, np.broadcast_to(left, covariance.shape[:-2]), factor)
-    shape = (*covariance.shape[:-3], *points.shape[:-1])
-    return TargetError(*(value.reshape(shape) for value in found))
+    batch = covariance.shape[:-3]
+    return _errors(calibration, covariance.reshape(*batch, *points.shape[:-1], 3, 3))
 
 
 def tre_over(calibration: Calibration, points: Float[np.ndarray, "m 2"]) -> TargetError:
@@ -299,29 +299,26 @@ def tre_over(calibration: Calibration, points: Float[np.ndarray, "m 2"]) -> Targ
     values, vectors = np.linalg.eigh(weight)
     root = vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]
     spread = np.swapaxes(root, -1, -2) @ covariance @ root
-    left = np.asarray(degrees_of_freedom(calibration), float)
-    factor = np.asarray(variance_factor(calibration))
-    return TargetError(*_errors(spread, np.broadcast_to(left, spread.shape[:-2]), factor))
+    return _errors(calibration, spread)
 
 
-def _errors(
-    covariance: Float[np.ndarray, "*shape k k"],
-    left: Float[np.ndarray, "*shape"],
-    factor: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Root mean square and interval of the length of a vector with Student's distribution."""
+def _errors(calibration: Calibration, covariance: Float[np.ndarray, "*shape k k"]) -> TargetError:
+    """Of vectors with Student's distribution and these covariances; a batch's axes come first."""
     finite = np.asarray(np.isfinite(covariance).all(axis=(-1, -2)))
     spread = np.where(finite[..., None, None], covariance, np.eye(covariance.shape[-1]))
     values = np.maximum(np.linalg.eigvalsh(spread), 0.0)
-    flat, freedom = values.reshape(-1, values.shape[-1]), left.reshape(-1)
-    lower, upper = np.empty(len(flat)), np.empty(len(flat))
-    for each in np.unique(freedom):
-        rows = np.asarray(freedom == each)
+    batch = np.shape(calibration.status_code)
+    alike = (*batch, *[1] * (finite.ndim - len(batch)))
+    factor = np.asarray(variance_factor(calibration)).reshape(alike)
+    left = np.asarray(degrees_of_freedom(calibration), float).reshape(alike)
+    left = np.broadcast_to(left, finite.shape)
+    lower, upper = np.full(finite.shape, np.nan), np.full(finite.shape, np.nan)
+    for each in np.unique(left[finite]):
+        rows = finite & (left == each)
         for chance, out in ((0.5 - 0.5 * LEVEL, lower), (0.5 + 0.5 * LEVEL, upper)):
-            out[rows] = length_quantile(flat[rows], float(each), chance)
-    rms = np.sqrt(factor * values.sum(axis=-1))
-    found = rms, lower.reshape(left.shape), upper.reshape(left.shape)
-    return tuple(np.where(finite, value, np.nan) for value in found)  # pyright: ignore[reportReturnType]
+            out[rows] = length_quantile(values[rows], float(each), chance)
+    rms = np.where(finite, np.sqrt(factor * values.sum(axis=-1)), np.nan)
+    return TargetError(rms, lower, upper)
 
 
 def length_quantile(
@@ -371,7 +368,7 @@ def _solve(
         near: a step shorter than this is the last; the error is of the order of its square.
     """
     at = start
-    low, high = np.full(len(at), radial.first), np.full(len(at), radial.last)
+    low, high = np.full(len(at), _FIRST), np.full(len(at), _LAST)
     for _ in range(_MOST_STEPS):
         below, slope = radial.mean(at[:, None] - along)
         low, high = np.where(below < chance, at, low), np.where(below < chance, high, at)
@@ -400,51 +397,41 @@ def _directions(dimensions: int) -> Float[np.ndarray, "d k"]:
 
 @dataclass(frozen=True)
 class _Radial:
-    """Probabilities that rho^2 is below values whose logarithms are evenly spaced.
+    """The distribution of rho^2.
 
     Attributes:
-        first: the least logarithm.
-        last: the largest.
-        below: the probabilities.
+        below: probabilities that it is below :data:`_RADII` values.
         rise: from each probability to the next.
     """
 
-    first: float
-    last: float
     below: Float[np.ndarray, " r"]
     rise: Float[np.ndarray, " r"]
 
-    @property
-    def spacing(self) -> float:
-        """Distance of two successive logarithms."""
-        return (self.last - self.first) / (len(self.below) - 1)
-
     def quantile(self, chance: float) -> float:
         """The first of the logarithms at which a probability is reached."""
-        return self.first + self.spacing * int(np.searchsorted(self.below, chance))
+        return float(_FIRST + _SPACING * int(np.searchsorted(self.below, chance)))
 
     def mean(
         self, values: Float[np.ndarray, "m d"]
     ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
         """Mean probability, by linear interpolation, and its slope; ``values`` are overwritten."""
-        values -= self.first
-        values *= 1 / self.spacing
+        values -= _FIRST
+        values *= 1 / _SPACING
         np.clip(values, 0.0, len(self.below) - 1, out=values)
         left = values.astype(np.intp)
         values -= left
         rise = self.rise.take(left)
         values *= rise
         values += self.below.take(left)
-        return values.mean(axis=1), rise.mean(axis=1) / self.spacing
+        return values.mean(axis=1), rise.mean(axis=1) / _SPACING
 
 
 @cache
 def _radial(dimensions: int, freedom: float) -> _Radial:
     """The distribution of rho^2."""
-    first, last = np.log(1e-9), np.log(1e9)
-    square = np.exp(np.linspace(first, last, _RADII))
+    square = np.exp(np.linspace(_FIRST, _LAST, _RADII))
     if np.isfinite(freedom):
         below = special.fdtr(dimensions, freedom, square / dimensions)
     else:
         below = special.chdtr(dimensions, square)
-    return _Radial(float(first), float(last), below, np.diff(below, append=below[-1]))
+    return _Radial(below, np.diff(below, append=below[-1]))

@@ -13,9 +13,8 @@ References: Lilliefors 1967 (estimated parameters); the limits are from 4,000 si
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
+from scipy import special
 
 from jaxcal.diagnostics.residual_checks import FEWEST_TO_CHECK
 from jaxcal.model.distributions import FAMILIES
@@ -69,12 +68,8 @@ def distribution(family: str, u: Float[np.ndarray, " n"]) -> Float[np.ndarray, "
     if family == "bell":
         v = np.clip(u / 7**0.5, -1.0, 1.0)
         return 0.5 + 15 / 16 * (v - 2 / 3 * v**3 + v**5 / 5)
-    if family == "gaussian":
-        return np.array([0.5 * math.erfc(-each / 2**0.5) for each in u])
     # t4 has the variance 2.
-    t = u * 2**0.5
-    share = t / np.sqrt(4 + t**2)
-    return 0.5 + 0.75 * (share - share**3 / 3)
+    return np.asarray(special.ndtr(u) if family == "gaussian" else special.stdtr(4, u * 2**0.5))
 
 
 def offset_law(result: Calibration) -> dict[str, object] | None:

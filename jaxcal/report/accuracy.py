@@ -261,9 +261,10 @@ def _comparison(
     noise = np.asarray(noise_covariance(answer, problem), float)
     if not np.isfinite(noise[used]).all():
         return None
-    fit = conventional_fit(ImageErrors.of_closed_form(other, problem, answer.blocks), used, noise)
+    seen = ImageErrors.of_closed_form(other, problem, answer.blocks)
+    covariance, log_density = conventional_fit(seen, used, noise)
     jacobian = image_jacobian(answer, grid)
-    error = np.einsum("mia,ab,mib->", jacobian, fit.covariance, jacobian) / len(grid)
+    error = np.einsum("mia,ab,mib->", jacobian, covariance, jacobian) / len(grid)
     gaussian = np.einsum("mia,ab,mib->", jacobian, found.model_covariance, jacobian) / len(grid)
     # Compare where both calibrations put the image's pixels on the probe.
     mine = np.ones(2)
@@ -271,7 +272,7 @@ def _comparison(
         mine = np.asarray(answer.scale_mm_per_px) / spacing
     face = float(np.asarray(problem.face_offset))
     apart = distance(np.asarray(answer.image_to_probe), x, scale / mine, grid, face)
-    density = found.log_density - fit.log_density
+    density = found.log_density - log_density
     gain = spread = None
     # Within a bound, offsets fit themselves: their errors are zero, and have no density.
     if answer.prior != "bounded":

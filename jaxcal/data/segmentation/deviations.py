@@ -23,6 +23,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex64, Float
 
+from jaxcal.data.segmentation.time_of_flight import element_sums
+
 ENOUGH_MM = 2e-3
 """A Newton step shorter than this is the last: the error left is below 1e-6 mm."""
 
@@ -149,12 +151,5 @@ def _sums(parts) -> list[Array]:
     parts = list(parts)
     if parts[0][0].shape == parts[1][0].shape:
         parts = [[a + b for a, b in zip(*parts, strict=True)]]
-    totals = []
-    for terms in parts:
-        none = tuple(jnp.zeros((), term.dtype) for term in terms)
-
-        def plus(a: tuple, b: tuple) -> tuple:
-            return tuple(x + y for x, y in zip(a, b, strict=True))
-
-        totals.append(jax.lax.reduce(tuple(terms), none, plus, (terms[0].ndim - 1,)))
+    totals = [element_sums(*terms) for terms in parts]
     return list(totals[0]) if len(totals) == 1 else [a + b for a, b in zip(*totals, strict=True)]

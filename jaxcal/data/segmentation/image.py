@@ -141,26 +141,27 @@ def localise(
     if scatter.shape not in ((), (2,)) or not (np.isfinite(scatter) & (scatter >= 0)).all():
         raise InputError(f"target_sd_px must be one or two numbers >= 0, not {target_sd_px!r}")
     corner = np.array([first_column, first_row], dtype=float)
-    results: list[Spot | NotFoundError] = []
+    how = (compression, decibels_per_level, false_alarm, minimum_margin_db)
+    spots = []
     for index, frame in enumerate(stack):
         part = frame[first_row : first_row + rows, first_column : first_column + columns]
         centre = None if expected is None else expected[index] - corner
-        try:
-            results.append(
-                _localise_one(
-                    part,
-                    target,
-                    centre,
-                    radius,
-                    compression,
-                    decibels_per_level,
-                    false_alarm,
-                    minimum_margin_db,
-                )
-            )
-        except NotFoundError as reason:
-            results.append(reason)
-    return _collect(results, corner, np.diag(np.broadcast_to(scatter**2, (2,))))
+        spots.append(_localise_one(part, target, centre, radius, *how))
+
+    def stacked(name: str, *shape: int) -> np.ndarray:
+        values = np.array([getattr(spot, name) for spot in spots], dtype=float)
+        return values.reshape(-1, *shape)
+
+    return Localisation(
+        position=stacked("position", 2) + corner,
+        covariance=stacked("covariance", 2, 2) + np.diag(np.broadcast_to(scatter**2, (2,))),
+        found=np.array([not spot.reason for spot in spots], dtype=bool),
+        contrast_db=stacked("contrast_db"),
+        margin_db=stacked("margin_db"),
+        residual=stacked("residual"),
+        width=stacked("width", 2),
+        reason=tuple(spot.reason for spot in spots),
+    )
 
 
 def images_from_frames(
@@ -290,31 +291,6 @@ def _check_near(
     return np.broadcast_to(values, (count, 2)), float(within_px)
 
 
-def _collect(
-    results: list[Spot | NotFoundError], corner: np.ndarray, scatter: np.ndarray
-) -> Localisation:
-    count = len(results)
-    position, covariance = np.full((count, 2), np.nan), np.full((count, 2, 2), np.nan)
-    width, residual = np.full((count, 2), np.nan), np.full(count, np.nan)
-    found = np.zeros(count, bool)
-    for index, result in enumerate(results):
-        if isinstance(result, Spot):
-            found[index] = True
-            position[index] = result.position + corner
-            covariance[index] = result.covariance + scatter
-            width[index], residual[index] = result.width, result.residual
-    return Localisation(
-        position=position,
-        covariance=covariance,
-        found=found,
-        contrast_db=np.array([result.contrast_db for result in results], dtype=float),
-        margin_db=np.array([result.margin_db for result in results], dtype=float),
-        residual=residual,
-        width=width,
-        reason=tuple(str(r) if isinstance(r, NotFoundError) else "" for r in results),
-    )
-
-
 def _localise_one(
     frame: np.ndarray,
     target: Target,
@@ -325,46 +301,50 @@ def _localise_one(
     false_alarm: float,
     minimum_margin_db: float,
 ) -> Spot:
-    """The target in one region; positions relative to the region's first pixel."""
+    """The target in one region, or why there is none; positions count from its first pixel."""
+    contrast = margin = np.nan
     values = frame.astype(np.float64)
-    if not np.isfinite(values).all():
-        raise NotFoundError("the frame holds NaN or Inf")
-    if np.ptp(values) == 0:
-        raise NotFoundError("the frame is constant")
-    envelope = envelope_of(values, frame.dtype, compression, decibels_per_level)
-    saturated = saturated_pixels(values)
-    peak, rival = brightest(envelope, expected, radius)
-    shape, extent = half_maximum(envelope, peak)
-    keep_out = [int(np.ceil(4 * sd)) + 1 for sd in extent]
-    speckle = background(envelope, peak, keep_out)
-    rms = np.sqrt(2.0) * speckle.sigma
-    contrast = decibel(envelope[peak] / rms)
-    margin = decibel(envelope[peak] / max(rival(keep_out), rms))
-    # The brightest of N speckles exceeds t with probability of about N exp(-t^2 / 2 sigma^2).
-    cell = np.prod([max(np.sqrt(2 * np.pi) * size, 1.0) for size in speckle.size])
-    needed = decibel(np.sqrt(np.log(max(envelope.size / cell, 1.0) / false_alarm)))
-    if contrast < needed:
-        raise NotFoundError(
-            f"nothing stands out: the brightest spot is {contrast:.1f} dB over the background, "
-            f"speckle alone reaches {needed:.1f} dB",
-            contrast,
-            margin,
-        )
-    if margin < minimum_margin_db:
-        raise NotFoundError(
-            f"ambiguous, several bright spots: the next is only {margin:.1f} dB below",
-            contrast,
-            margin,
-        )
-    if shape.sum() < 3:
-        raise NotFoundError("a single bright pixel, not a spot", contrast, margin)
-    rows, columns = np.nonzero(shape)
-    high, wide = envelope.shape
-    if rows.min() == 0 or columns.min() == 0 or rows.max() == high - 1 or columns.max() == wide - 1:
-        raise NotFoundError("the bright spot is cut off by the border", contrast, margin)
-    if extent[0] > LARGEST_SPOT * high or extent[1] > LARGEST_SPOT * wide:
-        raise NotFoundError("the bright area is a structure, not a spot", contrast, margin)
-    spot = fit_spot(envelope, saturated, shape, extent, speckle, target, contrast, margin)
-    if expected is not None and np.linalg.norm(spot.position - expected) > radius:
-        raise NotFoundError("the spot lies farther from the expected place", contrast, margin)
+    try:
+        if not np.isfinite(values).all():
+            raise NotFoundError("the frame holds NaN or Inf")
+        if np.ptp(values) == 0:
+            raise NotFoundError("the frame is constant")
+        envelope = envelope_of(values, frame.dtype, compression, decibels_per_level)
+        peak, rival = brightest(envelope, expected, radius)
+        shape, extent = half_maximum(envelope, peak)
+        keep_out = [int(np.ceil(4 * sd)) + 1 for sd in extent]
+        speckle = background(envelope, peak, keep_out)
+        rms = np.sqrt(2.0) * speckle.sigma
+        contrast = decibel(envelope[peak] / rms)
+        margin = decibel(envelope[peak] / max(rival(keep_out), rms))
+        # The brightest of N speckles exceeds t with probability of about N exp(-t^2 / 2 sigma^2).
+        cell = np.prod([max(np.sqrt(2 * np.pi) * size, 1.0) for size in speckle.size])
+        needed = decibel(np.sqrt(np.log(max(envelope.size / cell, 1.0) / false_alarm)))
+        if contrast < needed:
+            raise NotFoundError(
+                f"nothing stands out: the brightest spot is {contrast:.1f} dB over the background, "
+                f"speckle alone reaches {needed:.1f} dB"
+            )
+        if margin < minimum_margin_db:
+            raise NotFoundError(
+                f"ambiguous, several bright spots: the next is only {margin:.1f} dB below"
+            )
+        _check_shape(shape, extent)
+        spot = fit_spot(envelope, saturated_pixels(values), shape, extent, speckle, target, margin)
+        if expected is not None and np.linalg.norm(spot.position - expected) > radius:
+            raise NotFoundError("the spot lies farther from the expected place")
+    except NotFoundError as reason:
+        return Spot(contrast_db=contrast, margin_db=margin, reason=str(reason))
     return spot
+
+
+def _check_shape(shape: np.ndarray, extent: tuple[float, float]) -> None:
+    """Refuse what is no spot, by its pixels above half the maximum and its SDs along v and u."""
+    if shape.sum() < 3:
+        raise NotFoundError("a single bright pixel, not a spot")
+    border = np.ones_like(shape)
+    border[1:-1, 1:-1] = False
+    if (shape & border).any():
+        raise NotFoundError("the bright spot is cut off by the border")
+    if (np.array(extent) > LARGEST_SPOT * np.array(shape.shape)).any():
+        raise NotFoundError("the bright area is a structure, not a spot")

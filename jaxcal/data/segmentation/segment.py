@@ -170,7 +170,8 @@ def segment(
     used = images.mask
     check_times_of_flight(times, probe, used)
     distances = np.where(used[:, None], probe.one_way_range_mm(times), np.nan)
-    lines = (np.isfinite(distances) & (distances > 0)).sum(axis=1)
+    accepted = np.isfinite(distances) & (distances > 0)
+    lines = accepted.sum(axis=1)
 
     failed = used & (lines < floor)
     if minimum_amplitude is not None:
@@ -179,7 +180,6 @@ def segment(
         failed |= used & (images.amplitude < minimum_amplitude)
 
     out_of_plane = None
-    accepted = np.isfinite(distances) & (distances > 0)
     if method == "shortest":
         points, covariance, noise, rejected = _shortest(distances, probe, interpolate)
     else:

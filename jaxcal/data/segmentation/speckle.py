@@ -36,11 +36,7 @@ _SPECKLE_SAMPLE = 512
 
 
 class NotFoundError(Exception):
-    """Why a frame has no credible target, with what was measured of it."""
-
-    def __init__(self, reason: str, contrast_db: float = np.nan, margin_db: float = np.nan):
-        super().__init__(reason)
-        self.contrast_db, self.margin_db = contrast_db, margin_db
+    """Why a frame has no credible target."""
 
 
 @dataclass(frozen=True)
@@ -76,16 +72,13 @@ def envelope_of(
         per_level = nepers * decibels_per_level
     else:
         # Two quantiles that a black floor does not reach.
-        per_level, speckle = 0.0, _without_brightest(values)
+        per_level, speckle = nepers * USUAL_DECIBELS / full, _without_brightest(values)
         for low, high in ((0.5, 0.9), (0.8, 0.96)):
             first, second = np.quantile(speckle, (low, high))
             if first > floor and second > first:
                 expected = 0.5 * np.log(np.log1p(-high) / np.log1p(-low))
                 per_level = expected / (second - first)
                 break
-        usual = nepers * USUAL_DECIBELS / full
-        if per_level == 0.0:
-            per_level = usual
         per_level = float(np.clip(per_level, nepers * 20.0 / full, nepers * 150.0 / full))
     return np.exp(per_level * (values - values.max()))
 

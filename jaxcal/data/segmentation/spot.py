@@ -17,7 +17,7 @@ through the fit: W C W', where C is the noise's covariance and W the pseudo-inve
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -48,23 +48,25 @@ _EXCESS = 2.0
 
 @dataclass(frozen=True)
 class Spot:
-    """A fitted target.
+    """A fitted target, or what was measured of a frame without one; NaN where nothing was.
 
     Attributes:
         position: [u, v], px.
-        covariance: (2, 2), px^2.
+        covariance: px^2.
         contrast_db: envelope over the background's root mean square, dB.
         margin_db: envelope over the next brightest place, dB.
         residual: root mean square of the fit's residual over the target's envelope.
         width: SDs along u and v, px.
+        reason: why there is no target; empty where there is one.
     """
 
-    position: np.ndarray
-    covariance: np.ndarray
-    contrast_db: float
-    margin_db: float
-    residual: float
-    width: np.ndarray
+    position: Float[np.ndarray, " 2"] = field(default_factory=lambda: np.full(2, np.nan))
+    covariance: Float[np.ndarray, "2 2"] = field(default_factory=lambda: np.full((2, 2), np.nan))
+    contrast_db: float = np.nan
+    margin_db: float = np.nan
+    residual: float = np.nan
+    width: Float[np.ndarray, " 2"] = field(default_factory=lambda: np.full(2, np.nan))
+    reason: str = ""
 
 
 def saturated_pixels(values: np.ndarray) -> Bool[np.ndarray, "rows columns"]:
@@ -138,14 +140,9 @@ def fit_spot(
     extent: tuple[float, float],
     speckle: Speckle,
     target: Target,
-    contrast: float,
     margin: float,
 ) -> Spot:
     """Least squares of the spot on a window, and its covariance from the background's speckle."""
-
-    def not_found(why: str) -> NotFoundError:
-        return NotFoundError(why, contrast, margin)
-
     rows, columns = np.nonzero(shape)
     weights = envelope[rows, columns]
     start = np.array([np.average(columns, weights=weights), np.average(rows, weights=weights)])
@@ -153,34 +150,34 @@ def fit_spot(
     window = _Window.around(start, extent, envelope, ~saturated)
     first = _first_guess(start, extent, speckle, target, top)
     if np.sum(window.pixels[window.use] > 0.1 * top) < len(first):
-        raise not_found("the display is saturated: only the spot's outline is left")
+        raise NotFoundError("the display is saturated: only the spot's outline is left")
 
     fit = _Fit(window, first, _steps(first, extent), top)
     unknowns = fit.solve()
     if unknowns is None:
-        raise not_found("no spot could be fitted")
+        raise NotFoundError("no spot could be fitted")
     if (np.abs(unknowns[:2] - start) > 1 + np.array([extent[1], extent[0]])).any():
-        raise not_found("the fit left the bright spot")
+        raise NotFoundError("the fit left the bright spot")
 
     value, _ = window.model(unknowns)
     if not np.isfinite(value).all():
-        raise not_found("no spot could be fitted")
+        raise NotFoundError("no spot could be fitted")
     width = _width(unknowns)
     misfit = float(np.mean((window.pixels - value)[window.use] ** 2))
     jacobian = fit.slope(unknowns)
     inverse = np.linalg.pinv(jacobian, rcond=1e-9)[:2]
     if np.abs(inverse @ jacobian - np.eye(2, len(first))).max() > 1e-3:
-        raise not_found("the position is not determined")
+        raise NotFoundError("the position is not determined")
     by_pixel = np.zeros((2, *value.shape))
     by_pixel[:, window.use] = inverse[:, : window.use.sum()] / top
     across = (width[1], width[0])
     covariance = _propagate(by_pixel, value, misfit, speckle, across, window.v, window.u)
     if not np.isfinite(covariance).all():
-        raise not_found("the position is not determined")
+        raise NotFoundError("the position is not determined")
     # The centre must have converged. The shape need not, where the data hardly determine it.
     left = np.abs(inverse @ fit.residual(unknowns))
     if (left > 0.1 * np.sqrt(np.diag(covariance))).any():
-        raise not_found("no spot could be fitted")
+        raise NotFoundError("no spot could be fitted")
     height = float(np.sqrt(np.sum(np.exp(2 * unknowns[3::4]))))
     return Spot(
         position=unknowns[:2],

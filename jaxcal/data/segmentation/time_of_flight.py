@@ -51,15 +51,13 @@ class DistanceFit(eqx.Module):
     Attributes:
         position: [lateral, axial] mm (linear array: [lateral, range]), or
             [lateral, axial, elevation squared] in mm, mm and mm^2.
-        covariance: of the position, from the frame's own noise.
-        inverse_normal: the covariance for a distance of unit variance.
+        inverse_normal: the position's covariance for a distance of unit variance.
         noise: SD of one distance, mm, from the residuals.
         lines: elements that answered.
         rejected: of these, how many were given no weight.
     """
 
     position: Float[Array, "*batch p"]
-    covariance: Float[Array, "*batch p p"]
     inverse_normal: Float[Array, "*batch p p"]
     noise: Float[Array, "*batch"]
     lines: Float[Array, "*batch"]
@@ -173,7 +171,7 @@ def _cleaned(distances, element_positions) -> tuple[Array, Array, Array, Array]:
     return jnp.where(answered, d, 0.0), answered.astype(d.dtype), e[:, 0], e[:, 2]
 
 
-def _sums(*terms: Float[Array, "*batch elements"]) -> tuple[Float[Array, "*batch"], ...]:
+def element_sums(*terms: Float[Array, "*batch elements"]) -> tuple[Float[Array, "*batch"], ...]:
     """Sums over the last axis, all in one reduction: one pass, no arrays in between."""
     zeros = tuple(jnp.zeros((), term.dtype) for term in terms)
 
@@ -190,7 +188,7 @@ def _closed_form(d: Array, m: Array, ex: Array, ez: Array) -> tuple[Array, Array
     """
     ex, ez = jnp.broadcast_to(ex, d.shape), jnp.broadcast_to(ez, d.shape)
     square = m * (d * d - ex * ex - ez * ez)
-    lines, sx, sz, sxx, sxz, sq, sxq, largest = _sums(
+    lines, sx, sz, sxx, sxz, sq, sxq, largest = element_sums(
         m, m * ex, m * ez, m * ex * ex, m * ex * ez, square, square * ex, m * d
     )
     mx, mz, mq = sx / lines, sz / lines, sq / lines
@@ -216,7 +214,7 @@ def _iterate(
     steps: int,
     out_of_plane: bool,
 ) -> DistanceFit:
-    """Gauss-Newton from a start; the last pass also gives the covariance."""
+    """Gauss-Newton from a start; the last pass also gives the inverse normal matrix."""
     unknowns = 3 if out_of_plane else 2
 
     def derivatives(at: _Values) -> tuple[tuple[Array, ...], Array]:
@@ -238,7 +236,9 @@ def _iterate(
     def equal(at: _Values) -> tuple[_Values, list[Array], Array]:
         columns, residual = derivatives(at)
         weighted = [m * column for column in columns]
-        *products, rss = _sums(*_products(weighted, columns, residual), m * residual * residual)
+        *products, rss = element_sums(
+            *_products(weighted, columns, residual), m * residual * residual
+        )
         step, inverse = _solve(products, unknowns)
         # Residuals after the step, to first order: the square falls by g . step.
         gradient = products[-unknowns:]
@@ -256,7 +256,7 @@ def _iterate(
         efficient = stage == "efficient"
         extra = weight if efficient else m * jnp.maximum(1 - square / _CUT_SCALE**2, 0.0) ** 3
         weighted = [weight * column for column in columns]
-        *products, total, spread, lost = _sums(
+        *products, total, spread, lost = element_sums(
             *_products(weighted, columns, residual), extra, weight * square, m * (root <= 0.0)
         )
         step, inverse = _solve(products, unknowns)
@@ -292,7 +292,6 @@ def _iterate(
     )
     return DistanceFit(
         position=position,
-        covariance=matrix * (noise**2)[..., None, None],
         inverse_normal=matrix,
         noise=noise,
         lines=lines,
