@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -140,7 +141,7 @@ def test_the_command_tells_who_agrees(files, capsys):
     assert main(["compare", *files[1:], *PIXELS]) == 5
     page = " ".join(capsys.readouterr().out.split())
     assert "do not agree: image points are 4.80 mm apart" in page
-    assert "less accurate than it states" in page
+    assert "less accurate than its covariance says" in page
     assert main(["compare", *files, *PIXELS]) == 5
     printed = capsys.readouterr().out
     page = " ".join(printed.split())
@@ -151,6 +152,18 @@ def test_the_command_tells_who_agrees(files, capsys):
     pairs = json.loads(capsys.readouterr().out)["pairs"]
     assert [pair["agree"] for pair in pairs] == [True, False, False]
     assert pairs[0]["points"] == [[100, 300], [390, 490]]
+
+
+def test_a_verdict_that_expects_larger_errors_is_told(files, capsys):
+    known = jaxcal.load_calibration(files[2])
+    replace(known, tre_factor=2.8).save(files[2])
+    said = told(capsys, *files[1:])
+    assert said.count("expects errors 2.8 times as large as its covariance says") == 1
+    assert "2.8 times" in told(capsys, *files)
+    assert "times as large" not in told(capsys, *files[:2])
+    main(["compare", *files, *PIXELS, "--json"])
+    factors = json.loads(capsys.readouterr().out)["tre_factor"]
+    assert factors == dict(zip(files, (1.0, 1.0, 2.8), strict=True))
 
 
 def test_without_covariances_nothing_is_claimed(files, tmp_path, capsys):

@@ -41,7 +41,8 @@ def compare(
 
     Each CAL is a calibration.json of "jaxcal calibrate --out", or any other file that "jaxcal
     export" writes. They must be of the same probe and marker, from different recordings. The status
-    is 5 if two of them are farther apart than 95 % of such pairs would be by their covariances.
+    is 5 if two of them are farther apart than 95 % of such pairs would be by their covariances. If
+    the verdict of one expects larger errors than its covariance says, the factor is told.
     """
     import numpy as np
 
@@ -69,13 +70,20 @@ def compare(
     ]
     sources = [stated_source(name) for name in calibrations]
     shared = sorted({name for name in sources if name and sources.count(name) > 1})
+    factors = {name: made.tre_factor for name, made in zip(calibrations, transforms, strict=True)}
     notes = [
+        f"The verdict of {quoted(name)} expects errors {factor:.1f} times as large as its "
+        "covariance says. The expected distances do not include this."
+        for name, factor in factors.items()
+        if factor > 1
+    ]
+    notes += [
         f"Several calibrations state that they were made from {quoted(name)}. If that is one "
         "recording, they share its errors, and their distance says nothing about their accuracy."
         for name in shared
     ]
     if as_json:
-        print_json({"pairs": [_record(*pair) for pair in pairs]})
+        print_json({"pairs": [_record(*pair) for pair in pairs], "tre_factor": factors})
     elif len(pairs) == 1:
         unit = "mm" if transforms[0].scale_mm_per_px is None else "px"
         names, sizes = zip(
@@ -151,8 +159,8 @@ def _sentence(found: Comparison) -> str:
     if found.agree:
         return f"The calibrations agree: {apart}. {limit}"
     return (
-        f"The calibrations do not agree: {apart}. {limit} At least one is less accurate than it "
-        "states, or the probe's marker or the geometry of its image changed in between."
+        f"The calibrations do not agree: {apart}. {limit} At least one is less accurate than its "
+        "covariance says, or the probe's marker or the geometry of its image changed in between."
     )
 
 

@@ -381,8 +381,9 @@ def _print(
         "Tilts and turns from the middle orientation, with the marker to your right; left is where "
         "the lateral position is smallest. Take them in any order.",
         *reached,
-        f"Predicted with {these}{before}: error over the image "
-        f"{found.tre_mm[-1]:.2g} mm, reconstruction precision {found.rp_mm[-1]:.2g} mm.",
+        # A test of real images has their own errors as well.
+        f"Predicted with {these}{before}: error over the image {found.tre_mm[-1]:.2g} mm, "
+        f"reconstruction precision of images without errors {found.rp_mm[-1]:.2g} mm.",
         *([f"Images needed{total} for an error of {'; '.join(counts)}."] if counts else []),
         *(_simulated_in_words(errors) for errors in record.get("simulated", ())),
         *([] if figure is None else [f"figure: {figure}"]),
@@ -394,5 +395,5 @@ def _simulated_in_words(errors: dict[str, Any]) -> str:
     return (
         f"In {errors['trials']} simulated recordings with {errors['law']} offsets: error over the "
         f"image {errors['tre_mm']:.2g} mm (below {errors['tre_95_mm']:.2g} mm in 95 of 100), "
-        f"reconstruction precision {errors['rp_mm']:.2g} mm.{lost}"
+        f"reconstruction precision of images without errors {errors['rp_mm']:.2g} mm.{lost}"
     )
