@@ -11,7 +11,7 @@ Numpy and scipy throughout: this runs once a recording, on hundreds of samples a
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -30,13 +30,18 @@ LEVER_MM = 100.0
 LARGEST_LAG_S = 0.5
 """Largest lag looked for, in both directions."""
 
+LARGEST_LAG_SD_S = 0.02
+"""Largest SD of a lag that is used: a probe moves by about a millimetre in this time."""
+
+_TILT = np.tan(np.radians(30.0))
+
 _LAG_STEP_S = 1e-3
 _SHORTEST_OVERLAP_S = 1.0
 _RIVAL = 0.98
 _MINIMUM_CORRELATION = 0.8
 _COARSEST_S = 1e-3
 """A clock's times, as seconds, have digits for at least a millisecond."""
-_PARABOLA_STEPS = 5
+_PARABOLA_STEPS, _TOP = 5, 0.99
 
 
 def _increasing(t: np.ndarray, what: str, minimum: int = 2) -> Float[np.ndarray, " n"]:
@@ -254,23 +259,6 @@ def _lower_envelope(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
     return slope, float(y[a] - slope * x[a])
 
 
-def motion_along_main_axis(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, " n"]:
-    """Position (mm) along the direction in which a probe moved most, for :func:`estimate_latency`.
-
-    The sign of the direction is arbitrary.
-
-    Raises:
-        InputError: what is not poses, see :func:`jaxcal.data.poses.check_poses`.
-    """
-    return along_main_axis(check_poses(poses)[:, :3, 3])
-
-
-def along_main_axis(positions: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
-    """Positions along the direction in which they differ most; its sign is arbitrary."""
-    centred = positions - positions.mean(axis=0)
-    return centred @ np.linalg.svd(centred, full_matrices=False)[2][0]
-
-
 @dataclass(frozen=True)
 class Latency:
     """By how much images lag behind poses.
@@ -301,7 +289,7 @@ def estimate_latency(
         t_video: (n,) stamps of the images, s, on the tracker's clock.
         video: (n,) position of something at rest as the images show it, in any unit.
         t_tracker: (m,) stamps of the poses, s.
-        tracker_mm: (m,) position of the probe, mm (:func:`motion_along_main_axis`).
+        tracker_mm: (m,) position of the probe, mm.
 
     Raises:
         InputError: too little motion or overlap, signals that do not agree, a best lag at the edge
@@ -342,6 +330,65 @@ def estimate_latency(
     return _peak(lags, correlation, len(t))
 
 
+def latency_of_positions(
+    t_video: Float[np.ndarray, " n"],
+    points: Float[np.ndarray, "n 2"],
+    t_tracker: Float[np.ndarray, " m"],
+    positions: Float[np.ndarray, "m 3"],
+) -> Latency:
+    """Lag of the images behind the poses, from a motion to and fro along one line.
+
+    The images' signal is :func:`estimate_latency`'s along the direction in which their points
+    differ most, and the tracker's along that of the probe. These may be different directions of
+    the motion: pixels are not square, and the image shows nothing of a motion across its plane. So
+    both are tilted by 30 degrees towards each of the other directions, and what that changes is
+    part of the SD. It is nothing where the motion is along one line.
+
+    Args:
+        t_video: stamps of the images, s, on the tracker's clock.
+        points: a target at rest in the images, px or mm.
+        t_tracker: stamps of the poses, s.
+        positions: of the probe, mm.
+
+    Raises:
+        InputError: as of :func:`estimate_latency`, or a motion that is not along one line.
+    """
+    video, tracker = _along_principal_axes(points), _along_principal_axes(positions)
+
+    def lag(one: np.ndarray, other: np.ndarray) -> Latency:
+        return estimate_latency(t_video, video @ one, t_tracker, tracker @ other)
+
+    image, space = np.eye(2), np.eye(3)
+    found = lag(image[0], space[0])
+    variance = found.sd_s**2
+    for by_image, by_space in (
+        (_TILT * image[1], 0.0 * space[1]),
+        (0.0 * image[1], _TILT * space[1]),
+        (0.0 * image[1], _TILT * space[2]),
+    ):
+        try:
+            ahead, behind = (
+                lag(image[0] + sign * by_image, space[0] + sign * by_space).lag_s
+                for sign in (1, -1)
+            )
+        except InputError:
+            variance = np.inf
+            break
+        variance += ((ahead - behind) / 2) ** 2
+    if variance > LARGEST_LAG_SD_S**2:
+        raise InputError(
+            "the probe was not moved along one line, so the lag cannot be told: move it to and fro "
+            "along one line of the image"
+        )
+    return replace(found, sd_s=float(np.sqrt(variance)))
+
+
+def _along_principal_axes(positions: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
+    """Positions along the directions in which they differ most, then next, ...; signs are free."""
+    centred = positions - positions.mean(axis=0)
+    return centred @ np.linalg.svd(centred, full_matrices=False)[2].T
+
+
 def _peak(lags: np.ndarray, correlation: np.ndarray, samples: int) -> Latency:
     strength = np.abs(correlation)
     best = int(np.argmax(strength))
@@ -353,14 +400,20 @@ def _peak(lags: np.ndarray, correlation: np.ndarray, samples: int) -> Latency:
         raise InputError(f"the lag is {lags[best]:.3g} s or beyond: look for larger ones")
     middle = strength[1:-1]
     tops = 1 + np.flatnonzero((middle >= strength[:-2]) & (middle > strength[2:]))
+    least = _RIVAL * strength[best]
     for other in tops:
-        if other != best and strength[other] > _RIVAL * strength[best]:
+        # The tracker's noise makes ripples on a broad peak: a rival has a valley in between.
+        valley = strength[min(best, other) : max(best, other) + 1].min()
+        if strength[other] > least > valley:
             raise InputError(
                 f"lags of {lags[best]:.3f} and {lags[other]:.3f} s fit equally well: move the "
                 "probe less regularly"
             )
-    # Interpolation between samples makes kinks of the size of a step, so the parabola is wider.
-    half = min(_PARABOLA_STEPS, best, len(lags) - 1 - best)
+    # Interpolation between samples, and the tracker's noise, make kinks: the parabola is wider. By
+    # 0.99 of the peak, terms of higher order do not matter yet.
+    broad = np.flatnonzero(strength < _TOP * strength[best])
+    half = int(np.min(np.abs(broad - best), initial=len(lags))) - 1
+    half = min(max(half, _PARABOLA_STEPS), best, len(lags) - 1 - best)
     near = slice(best - half, best + half + 1)
     bend, slope, top = np.polyfit(lags[near] - lags[best], strength[near], 2)
     if bend >= 0:

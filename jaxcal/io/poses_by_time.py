@@ -7,13 +7,12 @@ from dataclasses import replace
 import numpy as np
 
 from jaxcal import InputError
+from jaxcal.data.poses import check_poses
 from jaxcal.data.timing import (
-    along_main_axis,
     can_interpolate,
-    estimate_latency,
     interpolate_poses,
     interpolation_error,
-    motion_along_main_axis,
+    latency_of_positions,
 )
 from jaxcal.io.sequence import TrackedSequence
 from jaxcal.io.text import PoseTable
@@ -185,7 +184,7 @@ def lag_of_points(
 
     Raises:
         InputError: times missing, too little motion, or motions that do not agree; see
-            :func:`jaxcal.data.timing.estimate_latency`.
+            :func:`jaxcal.data.timing.latency_of_positions`.
     """
     ((pair, poses),) = tracking.transforms.items()
     kept = _increasing(tracking)
@@ -194,11 +193,9 @@ def lag_of_points(
     try:
         if not len(kept) or not len(rows):
             raise InputError("there are no poses, or no points")
-        found = estimate_latency(
-            images.time[rows[order]],
-            along_main_axis(points[order]),
-            tracking.time[kept],
-            motion_along_main_axis(poses[kept]),
+        positions = check_poses(poses[kept])[:, :3, 3]
+        found = latency_of_positions(
+            images.time[rows[order]], points[order], tracking.time[kept], positions
         )
     except InputError as error:
         raise InputError(f"--lag auto: {error} (or state the lag: --lag SECONDS)") from None
