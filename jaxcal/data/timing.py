@@ -358,19 +358,14 @@ def latency_of_positions(
     def lag(one: np.ndarray, other: np.ndarray) -> Latency:
         return estimate_latency(t_video, video @ one, t_tracker, tracker @ other)
 
-    image, space = np.eye(2), np.eye(3)
-    found = lag(image[0], space[0])
+    along = np.eye(2)[0], np.eye(3)[0]
+    found = lag(*along)
     variance = found.sd_s**2
-    for by_image, by_space in (
-        (_TILT * image[1], 0.0 * space[1]),
-        (0.0 * image[1], _TILT * space[1]),
-        (0.0 * image[1], _TILT * space[2]),
-    ):
+    for towards in np.eye(5)[[1, 3, 4]]:
+        tilt = _TILT * towards[:2], _TILT * towards[2:]
         try:
-            ahead, behind = (
-                lag(image[0] + sign * by_image, space[0] + sign * by_space).lag_s
-                for sign in (1, -1)
-            )
+            ahead = lag(along[0] + tilt[0], along[1] + tilt[1]).lag_s
+            behind = lag(along[0] - tilt[0], along[1] - tilt[1]).lag_s
         except InputError:
             variance = np.inf
             break
@@ -386,7 +381,7 @@ def latency_of_positions(
 def _along_principal_axes(positions: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
     """Positions along the directions in which they differ most, then next, ...; signs are free."""
     centred = positions - positions.mean(axis=0)
-    return centred @ np.linalg.svd(centred, full_matrices=False)[2].T
+    return centred @ np.linalg.eigh(centred.T @ centred)[1][:, ::-1]
 
 
 def _peak(lags: np.ndarray, correlation: np.ndarray, samples: int) -> Latency:
