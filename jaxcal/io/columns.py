@@ -86,6 +86,17 @@ class Columns:
     time_s: float | None = None
 
 
+def names_columns(cells: list[str]) -> bool:
+    """Whether most of the cells are names of columns, rather than words of a sentence."""
+    bases = [_split(cell)[0] for cell in cells]
+    known = [
+        base
+        for base in bases
+        if base in _ROLE or _CELL.fullmatch(base) or _NUMBERED.fullmatch(base)
+    ]
+    return 2 * len(known) > len(cells)
+
+
 def columns_of_header(names: list[str], quaternion: QuaternionOrder | None) -> Columns:
     """The columns that a header names.
 
@@ -157,15 +168,17 @@ def _unknown(names: list[str], column: int) -> FormatError:
     )
 
 
-def _base_and_unit(name: str) -> tuple[str, str | None]:
+def _split(name: str) -> tuple[str, str | None]:
     found = _UNIT.match(name.strip().lower())
     assert found is not None
-    unit = found[2] or found[3]
-    if unit is not None:
-        if unit not in _UNITS:
-            raise FormatError(f"the unit of {quoted(name)} is not known")
-        unit = _UNITS[unit]
-    return re.sub(r"[\s_.]+", "", found[1]), unit
+    return re.sub(r"[\s_.]+", "", found[1]), found[2] or found[3]
+
+
+def _base_and_unit(name: str) -> tuple[str, str | None]:
+    base, unit = _split(name)
+    if unit is not None and unit not in _UNITS:
+        raise FormatError(f"the unit of {quoted(name)} is not known")
+    return base, None if unit is None else _UNITS[unit]
 
 
 def _complete(roles: dict[str, int], names: tuple[str, ...], what: str) -> tuple[int, ...] | None:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from jaxcal import FormatError
+from jaxcal.io.columns import names_columns
 from jaxcal.io.lines import text_lines
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.messages import quoted
@@ -123,7 +124,8 @@ def read_table(
     Args:
         path: cells separated by semicolons, tabs, commas or white space: whichever of these the
             first line has, in this order. If it is not a comma, a comma may be the decimal sign.
-        header: the first line names the columns if none of its cells is a number.
+        header: the first line names the columns if none of its cells is a number; so does a
+            comment before it that holds as many names as there are columns.
         separator: the separator, if it is known; "" for white space.
 
     Raises:
@@ -170,6 +172,8 @@ def read_table(
         lines.pop()
     if not rows:
         raise FormatError(f"{name}: holds no rows of numbers")
+    if header and names is None:
+        names = _commented_header(path, lines[0], rows[0], separator or "")
     return Table(name, names, rows, lines, separator or "")
 
 
@@ -181,23 +185,30 @@ def csv_text(rows: Iterable[Sequence[object]]) -> str:
 
 
 def first_line(path: str | os.PathLike[str]) -> tuple[str, bool]:
-    """Separator in the first line of a table, and whether it names the columns."""
-    for _, content in text_lines(path):
+    """Separator in the first line of a table, and whether a header names the columns."""
+    for line, content in text_lines(path):
         if not _STATED_SEPARATOR.fullmatch(content.strip("\r\n")):
             separator = _separator_of(content)
-            return separator, _is_header(_cells(content, separator), separator)
+            cells = _cells(content, separator)
+            named = _is_header(cells, separator) or _commented_header(path, line, cells, separator)
+            return separator, bool(named)
     return "", False
 
 
-def has_commented_header(table: Table) -> bool:
-    """Whether the comment just before the first row has as many cells, as numpy writes a header."""
+def _commented_header(
+    path: str | os.PathLike[str], line: int, row: list[str], separator: str
+) -> list[str] | None:
+    """Names in the comment just before the first row, where ``numpy.savetxt`` writes a header."""
     before = ""
-    for line, content in text_lines(table.name, comments=True):
-        if line == table.lines[0]:
+    for number, content in text_lines(path, comments=True):
+        if number == line:
             break
         before = content.strip()
-    cells = _cells(before.removeprefix("#").strip(), table.separator)
-    return before.startswith("#") and len(cells) == len(table.rows[0])
+    if not before.startswith("#"):
+        return None
+    cells = _cells(before.removeprefix("#").strip(), separator)
+    header = len(cells) == len(row) and _is_header(cells, separator) and names_columns(cells)
+    return cells if header else None
 
 
 def _separator_of(content: str) -> str:

@@ -18,7 +18,7 @@ from jaxcal.data.poses import QuaternionOrder, check_poses, rotations_from_quate
 from jaxcal.data.recording import MINIMUM_IMAGES, Recording, make_images
 from jaxcal.io.columns import LENGTHS_MM, Columns, LengthUnit, columns_of_header
 from jaxcal.io.given_files import naming
-from jaxcal.io.table import Table, first_line, has_commented_header, parse_numbers, read_table
+from jaxcal.io.table import Table, first_line, parse_numbers, read_table
 from jaxcal.runtime.array_types import Float, Int
 from jaxcal.runtime.messages import counted, quoted
 
@@ -300,8 +300,6 @@ def _columns(table: Table, quaternion: QuaternionOrder | None) -> Columns:
         hint = ", or a first line that names the columns"
         if width == 2:
             hint = " (name two columns of points by a first line u,v)"
-        if has_commented_header(table):
-            hint = " (remove the # before the header)"
         raise FormatError(
             f"{table.row(0)}: {width} columns without a header; 15 or 19 (time, 12 or 16 "
             f"pose numbers, u and v) or 10 (time, x, y, z, a quaternion, u and v) are needed{hint}"
