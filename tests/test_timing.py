@@ -255,7 +255,7 @@ def test_a_lag_is_told_of_a_motion_along_a_line(across: float, least: int, most:
         (lambda t: motion(t) / 10, lambda t: motion(t) / 10, "moved by"),
         (lambda t: 0 * t, motion, "show no motion"),
         (lambda t: np.random.default_rng(1).normal(size=len(t)), motion, "same motion"),
-        (lambda t: motion(t - 0.53), motion, "larger ones"),
+        (lambda t: motion(t - 0.53), motion, "0.5 s or beyond, where the search ends: subtract"),
         (lambda t: 20 * np.sin(20 * t), lambda t: 20 * np.sin(20 * t), "fit equally well"),
         (lambda t: np.where(t > 5, np.nan, t), motion, "NaN"),
     ],

@@ -392,7 +392,10 @@ def _peak(lags: np.ndarray, correlation: np.ndarray, samples: int) -> Latency:
             f"images and poses do not show the same motion (correlation {strength[best]:.2f})"
         )
     if best in (0, len(lags) - 1):
-        raise InputError(f"the lag is {lags[best]:.3g} s or beyond: look for larger ones")
+        raise InputError(
+            f"the lag is {lags[best]:.3g} s or beyond, where the search ends: subtract about that "
+            "from the images' times, and estimate the rest"
+        )
     middle = strength[1:-1]
     tops = 1 + np.flatnonzero((middle >= strength[:-2]) & (middle > strength[2:]))
     least = _RIVAL * strength[best]
