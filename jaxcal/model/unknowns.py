@@ -284,6 +284,12 @@ def block_slice(blocks: Blocks, name: str) -> slice:
     raise KeyError(name)
 
 
+def further_slice(blocks: Blocks, name: str) -> slice:
+    """Where a free further unknown lies among all the free further unknowns of the blocks."""
+    at = block_slice(blocks, name)
+    return slice(at.start - RIGID_UNKNOWNS, at.stop - RIGID_UNKNOWNS)
+
+
 def with_prior(blocks: Blocks) -> Blocks:
     """Those of the blocks that have a prior, in the table's order."""
     return tuple(name for name in FURTHER if name in blocks and TABLE[name].prior_sd is not None)
@@ -301,8 +307,8 @@ def split_further(values: Any, blocks: Blocks) -> dict[str, list[Any]]:
     found = {}
     for name in FURTHER:
         if name in blocks:
-            at = block_slice(blocks, name)
-            found[name] = [values[..., k - RIGID_UNKNOWNS] for k in range(at.start, at.stop)]
+            at = further_slice(blocks, name)
+            found[name] = [values[..., k] for k in range(at.start, at.stop)]
     return found
 
 

@@ -83,8 +83,6 @@ def like(before: Any, values: np.ndarray) -> Any:
 
 def static(*, default: Any = dataclasses.MISSING) -> Any:
     """A field of an array tree that is no array: part of the tree's structure, and hashable."""
-    if default is dataclasses.MISSING:
-        return dataclasses.field(metadata={_STATIC: True})
     return dataclasses.field(default=default, metadata={_STATIC: True})
 
 

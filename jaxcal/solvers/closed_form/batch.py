@@ -80,7 +80,7 @@ def solve_batch(problems: Problem, estimate: tuple[str, ...], *, few: int = FEW)
         InputError: unknown names, a scale where there is none, or a transformation that began
             without JAX's 64 bits.
     """
-    check_estimate(estimate, problems.pixels, problems.spacing_known)
+    check_estimate(estimate, problems)
     problems = replace(
         problems, covariance=None, max_elevation=None, channels=None, sound_speed=None, delay=None
     )
@@ -94,11 +94,6 @@ def solve_batch(problems: Problem, estimate: tuple[str, ...], *, few: int = FEW)
         flat = map_arrays(lambda leaf: np.asarray(leaf, np.float64), flat)
         answer = _concrete(flat, estimate, few)
     return map_arrays(lambda leaf: leaf.reshape((*shape, *leaf.shape[1:])), answer)
-
-
-_compiled = jax.jit(
-    lambda problems, estimate: solve_traceable(problems, estimate), static_argnums=1
-)
 
 
 def _concrete(problems: Problem, estimate: tuple[str, ...], few: int) -> ClosedForm:
@@ -205,6 +200,9 @@ def solve_traceable(problems: Problem, estimate: tuple[str, ...]) -> ClosedForm:
         # M is positive definite, and so are the normal equations of t and c.
         unique=certified & alone,
     )
+
+
+_compiled = jax.jit(solve_traceable, static_argnums=1)
 
 
 def _rows(stacked: Array) -> Matrix:

@@ -80,9 +80,7 @@ def certify(
     x = np.concatenate([factors[0] * rotation[:, 0], factors[1] * rotation[:, 2]])
     if constraints.scaled:
         origin = origin + data.face_offset * rotation[:, 2]
-    seen = data.points.copy()
-    if not constraints.scaled:
-        seen[:, 1] += data.face_offset
+    seen = data.factors_of(constraints)
     in_probe = seen[:, :1] * x[:3] + seen[:, 1:] * x[3:] + origin
     cloud = np.einsum("nij,nj->ni", data.rotations, in_probe) + data.translations
     target = cloud.mean(axis=0) if point is None else real_array(point, "point")
