@@ -622,10 +622,7 @@ class MediumPrior(eqx.Module):
 
     @classmethod
     def of(
-        cls,
-        problems: Problem,
-        blocks: Blocks,
-        **prior_sd: Float[AnyArray, ""] | float,
+        cls, problems: Problem, blocks: Blocks, **prior_sd: Float[AnyArray, ""] | float
     ) -> MediumPrior | None:
         """The prior of those of sound speed and delay that are free; None where neither is.
 

@@ -276,12 +276,8 @@ def count_unknowns(blocks: Blocks) -> int:
 
 def block_slice(blocks: Blocks, name: str) -> slice:
     """Where a block lies in the tangent vector of the given blocks."""
-    start = 0
-    for block in blocks:
-        if block == name:
-            return slice(start, start + TABLE[block].size)
-        start += TABLE[block].size
-    raise KeyError(name)
+    start = count_unknowns(blocks[: blocks.index(name)])
+    return slice(start, start + TABLE[name].size)
 
 
 def further_slice(blocks: Blocks, name: str) -> slice:

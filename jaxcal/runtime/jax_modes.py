@@ -33,12 +33,6 @@ from jaxcal.runtime.arrays import decided, is_traced, jax_in_use, map_arrays
 P = ParamSpec("P")
 T = TypeVar("T")
 
-NO_64_BITS = (
-    "{name} computes in 64 bits, and JAX's are switched off inside this jit, vmap or grad. Call "
-    "the transformed function inside 'with jax.enable_x64(True):', or start Python with "
-    "JAX_ENABLE_X64=1"
-)
-
 
 def is_float64_on() -> bool:
     """Whether JAX makes 64-bit arrays here and now; so does numpy where JAX is not imported."""
@@ -149,7 +143,11 @@ def require_float64(name: str) -> None:
         InputError: inside a transformation that began without 64 bits; it says what to do.
     """
     if not is_float64_on():
-        raise InputError(NO_64_BITS.format(name=name))
+        raise InputError(
+            f"{name} computes in 64 bits, and JAX's are switched off inside this jit, vmap or "
+            "grad. Call the transformed function inside 'with jax.enable_x64(True):', or start "
+            "Python with JAX_ENABLE_X64=1"
+        )
 
 
 def with_dtype(tree: T, dtype: Any) -> T:

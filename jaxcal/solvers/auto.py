@@ -366,9 +366,7 @@ def median(
 
 
 def weights(
-    log_evidence: Float[Array, "k ..."],
-    change: Float[Array, "k ..."],
-    prior: Float[Array, " k"],
+    log_evidence: Float[Array, "k ..."], change: Float[Array, "k ..."], prior: Float[Array, " k"]
 ) -> tuple[Array, Array]:
     """The laws' probabilities, and which laws have finite results.
 

@@ -141,10 +141,7 @@ class System(eqx.Module):
 
 
 def tune(
-    iterate: Iterate,
-    observation: Observation,
-    images: ImagePlanes,
-    medium: MediumPrior | None,
+    iterate: Iterate, observation: Observation, images: ImagePlanes, medium: MediumPrior | None
 ) -> NoiseModel:
     """Tune the SDs, the unknowns and the mean from a nearby solution.
 

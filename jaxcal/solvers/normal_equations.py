@@ -192,12 +192,12 @@ def _derive(
 
 
 def over_elements(plane: Entry) -> Entry:
-    """A plane with an axis of elements summed over them."""
+    """A plane (batch, n, elements) summed over the elements; other planes as they are."""
     return plane if unrolled.is_zero(plane) or plane.ndim < 3 else jnp.sum(plane, axis=2)
 
 
 def weight_of(component: Component, images: ImagePlanes) -> Array:
-    """1 for every residual that is there."""
+    """1 where there is a residual, 0 elsewhere."""
     mask = images.mask if component.errors[0].ndim < 3 else images.mask[..., None]
     return mask if component.present is None else mask * component.present
 

@@ -186,12 +186,11 @@ def solve_traceable(problems: Problem, estimate: tuple[str, ...]) -> ClosedForm:
     # All that fits as well lies in a ball about the dual's minimiser (as in ``certify_point``).
     ball = 4 * (gap + rounding * size)
     alone = ball <= NEARBY**2 * least * jnp.sum(x * x, axis=0)
+    scale = problems.spacing * lengths.T if scaled else problems.spacing
     return ClosedForm(
         image_to_probe=transform,
         point_mm=(reduced.centre + target).T,
-        scale_mm_per_px=problems.spacing * (lengths.T if scaled else 1.0)
-        if problems.pixels
-        else None,
+        scale_mm_per_px=scale if problems.pixels else None,
         sound_speed_factor=lengths[1] if constraints.free == ("axial",) else jnp.ones_like(count),
         rms_mm=jnp.sqrt(objective / count),
         objective_mm2=objective,
@@ -236,9 +235,7 @@ def _off(constraints: QuadraticConstraints, x: Vector) -> Vector:
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _optimum(
-    estimate: tuple[str, ...],
-    matrix: Float[Array, "6 6 batch"],
-    vector: Float[Array, "6 batch"],
+    estimate: tuple[str, ...], matrix: Float[Array, "6 6 batch"], vector: Float[Array, "6 batch"]
 ) -> tuple[Float[Array, "6 batch"], Float[Array, "k batch"]]:
     """The x and the multipliers at the dual's maximum, by Newton's method; NaN where that fails."""
     constraints = CONSTRAINTS[estimate]
