@@ -80,6 +80,14 @@ class QuadraticConstraints:
         """Whether pixel sizes are unknown; they do not stretch the range of row 0."""
         return bool({"lateral", "common"} & set(self.free))
 
+    def allowed(self, lengths: Float[np.ndarray, " 2"]) -> Float[np.ndarray, " 2"]:
+        """The lengths of a1 and a3 that the constraints allow, nearest to the given ones."""
+        return {
+            (): np.ones(2),
+            ("common",): np.full(2, lengths.mean()),
+            ("axial",): np.array([1.0, lengths[1]]),
+        }.get(self.free, lengths)
+
 
 def _constraints() -> dict[tuple[str, ...], QuadraticConstraints]:
     one, two = np.diag([1.0, 0.0]), np.diag([0.0, 1.0])

@@ -305,12 +305,7 @@ def feasible(
     lengths = np.linalg.norm(pair, axis=0)
     lengths = np.where(lengths > 0, lengths, 1.0)
     left, _, right = np.linalg.svd(pair / lengths, full_matrices=False)
-    lengths = {
-        (): np.ones(2),
-        ("common",): np.full(2, lengths.mean()),
-        ("axial",): np.array([1.0, lengths[1]]),
-    }.get(constraints.free, lengths)
-    return ((left @ right) * lengths).T.ravel()
+    return ((left @ right) * constraints.allowed(lengths)).T.ravel()
 
 
 @cache
