@@ -53,9 +53,10 @@ CHUNK = 256
 """Problems in one call of the compiled program."""
 
 FEW = 1024
-"""So many problems are solved one by one, in about a second; to compile takes six."""
+"""Up to so many problems are solved one by one, in about a second; compiling takes six."""
 
 NEWTON_STEPS = 30
+"""Most steps of Newton's method on the dual."""
 MET = 500
 """Constraints are met when they are off by less than this many roundings of |x|^2."""
 SHORTER = 0.25
