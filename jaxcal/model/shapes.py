@@ -117,8 +117,9 @@ def tilted(
         family = "uniform"
     else:
         height = HEIGHT[family] / sd
-    low, high = -edge, edge
-    if interval is not None:
+    if interval is None:
+        low, high = -edge, edge
+    else:
         low, high = (jnp.clip(end, -edge, edge) for end in interval)
     # Within ``side`` of the interval's point nearest to its mean, the Gaussian falls by a factor
     # exp(-REACH^2 / 2), whether the mean is inside the interval or far out.
