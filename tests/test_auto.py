@@ -61,9 +61,9 @@ def test_moments_are_those_of_the_product(family, cut):
         points = [p for p in (*edges, mean) if low < p < high]
         moment = [quad(product, low, high, args=(k,), points=points, limit=200, epsabs=0)[0]
                   for k in range(3)]  # fmt: skip
-        bounds = (None, None) if cut is None else tuple(jnp.asarray([end]) for end in cut)
+        interval = None if cut is None else tuple(jnp.asarray([end]) for end in cut)
         at = (jnp.asarray([sd]), jnp.asarray([[mean]]), jnp.asarray([[variance]]))
-        found = jax.tree.map(np.asarray, tilted_of(family, *at, *bounds))
+        found = jax.tree.map(np.asarray, tilted_of(family, *at, interval))
         true_mean = moment[1] / moment[0]
         true_variance = moment[2] / moment[0] - true_mean**2
         assert float(np.log(found.mass[0, 0]) + found.log_factor[0, 0]) == pytest.approx(
@@ -123,9 +123,7 @@ def propagate(linear: Linear, families, sd, sweeps: int | None = None) -> Found:
         jnp.zeros((4, 6, 1)),
         jnp.eye(4)[..., None],
     )
-    sites = Sites(
-        [column[None] for column in direction.T], offset[None], linear.used[None], None, None
-    )
+    sites = Sites([column[None] for column in direction.T], offset[None], linear.used[None], None)
     squares, pull = direction.T @ direction, direction.T @ offset
     found = propagate_batch_last(
         known, sites, squares[..., None], pull[:, None], families, sd[:, None], **more_sweeps

@@ -375,6 +375,23 @@ def test_what_cannot_be_asked_for():
         jax.jit(lambda given: jaxcal.certify(given, np.eye(4)).gap_mm2)(problem)
 
 
+def test_what_no_certificate_can_be_about_is_refused():
+    """The bound needs lengths that ``estimate`` leaves free, else it may be above the minimum."""
+    points, square = drawn(0, 12), drawn(0, 12, estimate=("common-scale",))
+    pixels, faster = drawn(0, 12, estimate=SCALE), {"sound_speed_factor": 1.05}
+    for images, estimate, scale, more, said in (
+        (points, (), None, faster, "needs estimate"),
+        (pixels, SCALE, [0.2, 0.17], faster, "needs estimate"),
+        (square, "common-scale", [0.2, 0.21], {}, "one factor"),
+        (pixels, SCALE, [np.nan, 0.17], {}, "finite and positive"),
+        (points, "sound-speed", None, {"sound_speed_factor": np.nan}, "finite and positive"),
+        (points, (), None, {"point": np.array([np.nan, 0.0, 0.0])}, "3 finite numbers"),
+    ):
+        scale = None if scale is None else np.array(scale)
+        with pytest.raises(jaxcal.InputError, match=said):
+            jaxcal.certify(images, np.eye(4), scale_mm_per_px=scale, estimate=estimate, **more)
+
+
 def test_names_to_estimate_are_taken_as_by_calibrate():
     images = drawn(1, 8)
     named = jaxcal.calibrate_closed_form(images, estimate=("sound-speed",))

@@ -35,8 +35,8 @@ from jaxcal.diagnostics.image_errors import (
 )
 from jaxcal.diagnostics.sd_by_place import relative_sd
 from jaxcal.diagnostics.uncertainty import Uncertainty, inverses
-from jaxcal.model.outlying import stands_out
-from jaxcal.model.thresholds import FEWEST_IMAGES, MAD, RELATIVE_FLOOR
+from jaxcal.model.outlying import robust_sd, stands_out, studentise
+from jaxcal.model.thresholds import FEWEST_IMAGES
 from jaxcal.model.unknowns import block_slice, further_derivatives, measured
 from jaxcal.result.calibration import Calibration
 from jaxcal.result.findings import Inspection
@@ -121,18 +121,12 @@ def studentised_errors(
     by = np.where(seen.mask[..., None] > 0, by, 1.0)
     errors, rows = seen.errors / by, seen.rows[..., columns] / by[..., None]
 
-    # The unknowns' degrees of freedom are shared equally by the three components.
-    freedom = np.maximum(1 - len(columns) / (3 * kept.sum(axis=1, keepdims=True)), 0.1)
-    sigma = MAD * medians(np.abs(errors), kept) / np.sqrt(freedom)
-    least = np.maximum(RELATIVE_FLOOR * sigma.max(axis=1, keepdims=True), 1e-6)
-    sigma = np.maximum(sigma, least)[:, None]
-    rows = (rows / sigma[..., None]).reshape(len(rows), -1, len(columns))
+    sigma = robust_sd(medians(np.abs(errors), kept), kept.sum(axis=1), len(columns))
+    rows = (rows / sigma[:, None, :, None]).reshape(len(rows), -1, len(columns))
     used = rows * np.repeat(kept, 3, axis=1)[..., None]
     inverse = inverses(np.swapaxes(used, 1, 2) @ used, eps)
     leverage = quadratic(rows, inverse).reshape(errors.shape)
-    # An image in use pulls the fit towards itself; the fit predicts an image that is not in use.
-    left = np.where(kept[..., None] > 0, np.maximum(1 - leverage, 0.05), 1 + leverage)
-    return errors / np.sqrt(left) / sigma
+    return np.asarray(studentise(errors, leverage, sigma, kept))
 
 
 def range_at_place(

@@ -24,8 +24,8 @@ from jaxcal.model.unknowns import (
     FURTHER,
     RIGID_UNKNOWNS,
     Blocks,
-    block_slice,
     count_unknowns,
+    further_slice,
     step_between,
     stepped,
 )
@@ -206,8 +206,7 @@ class Iterate(eqx.Module):
         """The values of a further unknown, one row for each component; None if it is not free."""
         if name not in self.blocks:
             return None
-        at = block_slice(self.blocks, name)
-        return self.further_values[at.start - RIGID_UNKNOWNS : at.stop - RIGID_UNKNOWNS]
+        return self.further_values[further_slice(self.blocks, name)]
 
     def parameters(self) -> Parameters:
         """The parameters, batch axis first; unknowns that are not free are nominal."""
@@ -227,11 +226,8 @@ class Iterate(eqx.Module):
             step = jnp.stack(step)
         values = self.further_values
         if self.unknowns > RIGID_UNKNOWNS:
-            at = RIGID_UNKNOWNS
-            parts = []
-            for value, name in zip(values, _further_names(self.blocks), strict=True):
-                parts.append(stepped(name, value, step[at], jnp.exp))
-                at += 1
+            named = enumerate(zip(_further_names(self.blocks), values, strict=True), RIGID_UNKNOWNS)
+            parts = [stepped(name, value, step[at], jnp.exp) for at, (name, value) in named]
             values = jnp.stack(parts)
         turn = _cayley(step[3:6])
         return Iterate(

@@ -33,7 +33,7 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxcal import InputError
 from jaxcal.data.problem import Problem
@@ -41,10 +41,10 @@ from jaxcal.model.batch import ImagePlanes, Iterate, check_batch, pad_images, ta
 from jaxcal.model.thresholds import LARGEST_ELEVATION
 from jaxcal.model.unknowns import (
     FURTHER,
-    RIGID_UNKNOWNS,
     TABLE,
     Blocks,
     block_slice,
+    further_slice,
     measured,
     predicted_distance,
     step_between,
@@ -82,8 +82,7 @@ class FurtherUnknowns(eqx.Module):
         for name in FURTHER:
             components = iterate.further(name)
             if components is not None:
-                at = block_slice(iterate.blocks, name)
-                steps = tangent[at.start - RIGID_UNKNOWNS : at.stop - RIGID_UNKNOWNS]
+                steps = tangent[further_slice(iterate.blocks, name)]
                 values[name] = [
                     stepped(name, value[:, None], step, jnp.exp)
                     for value, step in zip(components, steps, strict=True)
@@ -329,11 +328,19 @@ def unit_shape(
     mean = jnp.sum(images.mask * variances[::2], axis=2) / images.used
     known = jnp.all(mean > 0, axis=0)
     mean = jnp.where(known, mean, 1.0)
-    scale = 1 / jnp.sqrt(mean)
-    by = jnp.stack([scale[0] * scale[0], scale[0] * scale[1], scale[1] * scale[1]])
+    return rescaled(variances, 1 / jnp.sqrt(mean), known[:, None] & (images.mask > 0)), mean
+
+
+def rescaled(
+    variances: Float[Array, "3 batch n"],
+    factors: Float[Array, "2 batch"],
+    where: Bool[Array, "batch n"],
+) -> Float[Array, "3 batch n"]:
+    """Covariances of errors that are multiplied by factors; unit matrices elsewhere."""
+    lateral, axial = factors
+    by = jnp.stack([lateral * lateral, lateral * axial, axial * axial])
     unit = jnp.asarray([1.0, 0.0, 1.0], variances.dtype)[:, None, None]
-    shaped = known[:, None] & (images.mask > 0)
-    return jnp.where(shaped, variances * by[..., None], unit), mean
+    return jnp.where(where, variances * by[..., None], unit)
 
 
 class ChannelDistances(Observation):
@@ -615,10 +622,7 @@ class MediumPrior(eqx.Module):
 
     @classmethod
     def of(
-        cls,
-        problems: Problem,
-        blocks: Blocks,
-        **prior_sd: Float[AnyArray, ""] | float,
+        cls, problems: Problem, blocks: Blocks, **prior_sd: Float[AnyArray, ""] | float
     ) -> MediumPrior | None:
         """The prior of those of sound speed and delay that are free; None where neither is.
 

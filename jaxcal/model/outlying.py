@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from jaxcal.runtime.array_types import AnyArray, Bool, Float
+from jaxcal.model.thresholds import MAD
+from jaxcal.runtime.array_types import AnyArray, Bool, Float, HeldArray
 from jaxcal.runtime.arrays import array_module
 
 CUT = 6.0
@@ -10,6 +11,46 @@ CUT = 6.0
 
 FEW_IMAGES = 30
 """With fewer images in use, n, the limit is wider by sqrt(30 / n): 9.5 SDs for a dozen."""
+
+RELATIVE_FLOOR = 0.02
+"""No component's SD is taken to be less than this share of the largest: smaller errors are no
+gross ones."""
+
+
+def with_floor(sigma: Float[AnyArray, "*batch 3"]) -> Float[HeldArray, "*batch 3"]:
+    """The components' SDs, mm, none below its floor."""
+    xp = array_module(sigma)
+    return xp.maximum(sigma, xp.maximum(RELATIVE_FLOOR * xp.max(sigma, -1, keepdims=True), 1e-6))
+
+
+def robust_sd(
+    medians: Float[AnyArray, "*batch 3"], count: Float[AnyArray, "*#batch"], unknowns: int
+) -> Float[HeldArray, "*batch 3"]:
+    """SDs of the components from the median magnitudes of their errors, mm.
+
+    Args:
+        medians: over the images in use, mm.
+        count: number of these images.
+        unknowns: number that was fitted; the components share its degrees of freedom equally.
+    """
+    xp = array_module(medians, count)
+    freedom = xp.maximum(1 - unknowns / (3 * count), 0.1)
+    return with_floor(MAD * medians / xp.sqrt(freedom)[..., None])
+
+
+def studentise(
+    errors: Float[AnyArray, "*batch n 3"],
+    leverage: Float[AnyArray, "*batch n 3"],
+    sigma: Float[AnyArray, "*batch 3"],
+    kept: Float[AnyArray, "*batch n"],
+) -> Float[HeldArray, "*batch n 3"]:
+    """Errors in SDs, corrected for leverage.
+
+    An image in use pulls the fit towards itself; the fit predicts an image that is not in use.
+    """
+    xp = array_module(errors, leverage, sigma, kept)
+    left = xp.where(kept[..., None] > 0, xp.maximum(1 - leverage, 0.05), 1 + leverage)
+    return errors / xp.sqrt(left) / sigma[..., None, :]
 
 
 def stands_out(

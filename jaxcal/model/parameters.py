@@ -2,8 +2,8 @@
 
 X steps on its manifold by the right perturbation X Exp([v, omega]), so v (mm) and omega (rad) are
 along and about the image's own axes (lateral, elevational, axial). Steps of further unknowns are
-described in :mod:`jaxcal.model.unknowns`, whose names can be imported from here, too. A solver is
-told which blocks are free; the rest stay fixed.
+described in :mod:`jaxcal.model.unknowns`. A solver is told which blocks are free; the rest stay
+fixed.
 """
 
 from __future__ import annotations

@@ -83,13 +83,16 @@ class Moments(eqx.Module):
     variance: Float[Array, "k n"]
 
 
+Interval = tuple[Float[Array, "*#k n"], Float[Array, "*#k n"]]
+"""The least and the largest offset that are allowed, about the shape's centre, mm."""
+
+
 def tilted(
     family: Family,
     sd: Float[Array, " k"],
     mean: Float[Array, "k n"],
     variance: Float[Array, "k n"],
-    lower: Float[Array, "*#k n"] | None = None,
-    upper: Float[Array, "*#k n"] | None = None,
+    interval: Interval | None = None,
 ) -> Moments:
     """Moments of shapes of one family times every image's Gaussian.
 
@@ -98,11 +101,9 @@ def tilted(
         sd: SD of each shape, mm.
         mean: of the Gaussian factor, about the shape's centre, mm.
         variance: of the Gaussian factor, mm^2.
-        lower: cut the product below this, mm.
-        upper: cut the product above this, mm.
+        interval: cut the product outside of it.
     """
     sd = sd[:, None]
-    cut = lower is not None or upper is not None
     log_factor = 0.0
     edge = EDGE[family] * sd
     if family == "gaussian":
@@ -111,13 +112,15 @@ def tilted(
         log_factor = -0.5 * mean**2 / both
         height = jax.lax.rsqrt(2 * np.pi * both)
         mean, variance = mean * sd**2 / both, variance * sd**2 / both
-        if not cut:
+        if interval is None:
             return Moments(height, log_factor, mean, variance)
         family = "uniform"
     else:
         height = HEIGHT[family] / sd
-    low = -edge if lower is None else jnp.clip(lower, -edge, edge)
-    high = edge if upper is None else jnp.clip(upper, -edge, edge)
+    if interval is None:
+        low, high = -edge, edge
+    else:
+        low, high = (jnp.clip(end, -edge, edge) for end in interval)
     # Within ``side`` of the interval's point nearest to its mean, the Gaussian falls by a factor
     # exp(-REACH^2 / 2), whether the mean is inside the interval or far out.
     nearest = jnp.clip(mean, low, high)
@@ -126,7 +129,7 @@ def tilted(
     side = reach / (jnp.abs(out) + jnp.sqrt(out * out + reach))
     low, high = jnp.maximum(low, nearest - side), jnp.minimum(high, nearest + side)
     middle, step = 0.5 * (low + high), (high - low) / (2 * NODES - 1)
-    abrupt = cut or family != "student"
+    abrupt = interval is not None or family != "student"
     precision = 1 / variance
     total, line, parabola = _sums(family, abrupt, (middle, step, nearest, out, precision, 1 / sd))
     inverse = 1 / total

@@ -13,6 +13,3 @@ FEWEST_IMAGES = 8
 
 MAD = 1.4826
 """SD of a normal law over the median of its magnitude."""
-
-RELATIVE_FLOOR = 0.02
-"""No component's SD is taken to be less than this share of the largest."""

@@ -276,12 +276,14 @@ def count_unknowns(blocks: Blocks) -> int:
 
 def block_slice(blocks: Blocks, name: str) -> slice:
     """Where a block lies in the tangent vector of the given blocks."""
-    start = 0
-    for block in blocks:
-        if block == name:
-            return slice(start, start + TABLE[block].size)
-        start += TABLE[block].size
-    raise KeyError(name)
+    start = count_unknowns(blocks[: blocks.index(name)])
+    return slice(start, start + TABLE[name].size)
+
+
+def further_slice(blocks: Blocks, name: str) -> slice:
+    """Where a free further unknown lies among all the free further unknowns of the blocks."""
+    at = block_slice(blocks, name)
+    return slice(at.start - RIGID_UNKNOWNS, at.stop - RIGID_UNKNOWNS)
 
 
 def with_prior(blocks: Blocks) -> Blocks:
@@ -301,8 +303,8 @@ def split_further(values: Any, blocks: Blocks) -> dict[str, list[Any]]:
     found = {}
     for name in FURTHER:
         if name in blocks:
-            at = block_slice(blocks, name)
-            found[name] = [values[..., k - RIGID_UNKNOWNS] for k in range(at.start, at.stop)]
+            at = further_slice(blocks, name)
+            found[name] = [values[..., k] for k in range(at.start, at.stop)]
     return found
 
 

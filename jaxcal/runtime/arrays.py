@@ -83,8 +83,6 @@ def like(before: Any, values: np.ndarray) -> Any:
 
 def static(*, default: Any = dataclasses.MISSING) -> Any:
     """A field of an array tree that is no array: part of the tree's structure, and hashable."""
-    if default is dataclasses.MISSING:
-        return dataclasses.field(metadata={_STATIC: True})
     return dataclasses.field(default=default, metadata={_STATIC: True})
 
 
@@ -106,8 +104,7 @@ def assembled(kind: type[T], values: dict[str, Any]) -> T:
     into it (tracers, shapes, None).
     """
     made = object.__new__(kind)
-    for name, value in values.items():
-        object.__setattr__(made, name, value)
+    vars(made).update(values)  # the dataclass is frozen
     return made
 
 
@@ -191,11 +188,6 @@ def _register(kind: type) -> None:
         return tuple(zip(keys, arrays, strict=True)), rest
 
     def whole(rest: tuple, arrays: Any) -> Any:
-        made = object.__new__(kind)
-        # Not setattr: the dataclass is frozen, and trees are taken apart often.
-        held = vars(made)
-        held.update(zip(names, arrays, strict=True))
-        held.update(zip(others, rest, strict=True))
-        return made
+        return assembled(kind, dict(zip(names + others, (*arrays, *rest), strict=True)))
 
     tree_util.register_pytree_with_keys(kind, parts_with_keys, whole, parts)

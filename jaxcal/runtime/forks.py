@@ -1,7 +1,7 @@
 """Whether JAX's threads are in this process; a fork leaves them in the parent, where they started.
 
-A compiled program would wait for them without end. Imported with jaxcal itself, since what is asked
-for is noted at the fork. A fork before JAX has started does no harm.
+A compiled program would wait for them without end. A fork before JAX has started does no harm. This
+module is imported with jaxcal itself, because the state has to be noted at the fork.
 """
 
 from __future__ import annotations

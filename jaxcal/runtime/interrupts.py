@@ -23,8 +23,8 @@ def no_interrupt_lost() -> Iterator[None]:
 
     Out of a destructor or a callback of the garbage collection (JAX has one) Python cannot raise.
     It prints "Exception ignored in", and the program runs on as if nobody had pressed Ctrl-C.
-    Nothing is done in other threads than the main one, where no interrupt is raised, nor within
-    another of its kind.
+    Other threads than the main one get no interrupts, so nothing is done there, nor within another
+    of its kind.
     """
     main = threading.current_thread() is threading.main_thread()
     if not main or getattr(sys.unraisablehook, "__module__", None) == __name__:

@@ -46,8 +46,4 @@ def import_path() -> list[str]:
     """
     here = os.path.realpath(os.getcwd())
     entries = [os.path.abspath(entry) for entry in sys.path if entry]
-    return [
-        entry
-        for entry in entries
-        if os.path.realpath(entry) != here or os.path.realpath(entry) == _ROOT
-    ]
+    return [entry for entry in entries if here == _ROOT or os.path.realpath(entry) != here]

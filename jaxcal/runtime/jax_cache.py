@@ -35,13 +35,14 @@ def folder() -> Path:
 
 
 def enable_compilation_cache() -> None:
-    """Let JAX keep what :mod:`jaxcal.runtime.executables` does not; without a word if it cannot.
+    """Let JAX keep what :mod:`jaxcal.runtime.executables` does not, and silence its compiler.
 
-    Done when JAX is imported, which not every calibration needs.
+    Both are done when JAX is imported, which not every calibration needs. If there can be no
+    folder, nothing is kept and nothing is said.
 
-    And silence the compiler, whose alarms ("Very slow compile?") ask users of XLA to file bugs. It
-    has no option for that but the level of its log, which is the whole process': so only the
-    command line does it, not the library, and not by an environment that other programs inherit.
+    The compiler's alarms ("Very slow compile?") ask users of XLA to file bugs. The only option for
+    them is the level of XLA's log, which is that of the whole process. So the command line sets it
+    and the library does not; and not by an environment variable, which other programs inherit.
     """
     global _wanted
     _wanted = True

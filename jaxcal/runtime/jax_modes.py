@@ -33,12 +33,6 @@ from jaxcal.runtime.arrays import decided, is_traced, jax_in_use, map_arrays
 P = ParamSpec("P")
 T = TypeVar("T")
 
-NO_64_BITS = (
-    "{name} computes in 64 bits, and JAX's are switched off inside this jit, vmap or grad. Call "
-    "the transformed function inside 'with jax.enable_x64(True):', or start Python with "
-    "JAX_ENABLE_X64=1"
-)
-
 
 def is_float64_on() -> bool:
     """Whether JAX makes 64-bit arrays here and now; so does numpy where JAX is not imported."""
@@ -118,19 +112,12 @@ def importing_jax(function: Callable[P, T]) -> Callable[P, T]:
     return after_import
 
 
-def in_standard_promotion(function: Callable[P, T]) -> Callable[P, T]:
-    """Decorate a rule that JAX calls later, outside the public function that it belongs to.
+in_standard_promotion = own_modes(bits_too=False)
+"""Decorates a rule that JAX calls later, outside the public function that it belongs to.
 
-    Rules of differentiation and batching of a function that the caller compiled are traced when the
-    caller transforms it.
-    """
-
-    @wraps(function)
-    def rule(*args: P.args, **kwargs: P.kwargs) -> T:
-        with own_modes(bits_too=False):
-            return function(*args, **kwargs)
-
-    return rule
+Rules of differentiation and batching of a function that the caller compiled are traced when the
+caller transforms it.
+"""
 
 
 def traceable(function: Callable[P, T]) -> Callable[P, T]:
@@ -156,24 +143,24 @@ def require_float64(name: str) -> None:
         InputError: inside a transformation that began without 64 bits; it says what to do.
     """
     if not is_float64_on():
-        raise InputError(NO_64_BITS.format(name=name))
+        raise InputError(
+            f"{name} computes in 64 bits, and JAX's are switched off inside this jit, vmap or "
+            "grad. Call the transformed function inside 'with jax.enable_x64(True):', or start "
+            "Python with JAX_ENABLE_X64=1"
+        )
 
 
 def with_dtype(tree: T, dtype: Any) -> T:
-    """A pytree whose floating arrays, traced or not, have this dtype."""
-    if jax_in_use() is None:
-        floating = np.floating
-        return map_arrays(
-            lambda a: a.astype(dtype, copy=False) if np.issubdtype(a.dtype, floating) else a, tree
-        )
-    import jax
-    import jax.numpy as jnp
+    """A tree (:func:`map_arrays`) whose floating arrays, traced or not, have this dtype."""
+    jax = jax_in_use()
+    # Only JAX's functions know of bfloat16 and its like.
+    xp = np if jax is None else jax.numpy
 
     def cast(leaf: Any) -> Any:
-        floating = jnp.issubdtype(leaf.dtype, jnp.floating) and leaf.dtype != dtype
-        return leaf.astype(dtype) if floating else leaf
+        other = xp.issubdtype(leaf.dtype, xp.floating) and leaf.dtype != dtype
+        return leaf.astype(dtype) if other else leaf
 
-    return jax.tree.map(cast, tree)
+    return map_arrays(cast, tree)
 
 
 def _without_jax(leaf: Any) -> Any:

@@ -96,8 +96,7 @@ def private_folder(name: str = "programs") -> Path:
         found = place.lstat()
         if not stat.S_ISDIR(found.st_mode):
             raise NotADirectoryError(place)
-        # Windows keeps its profile folders private by other means.
-        if os.name == "posix" and (found.st_uid != os.geteuid() or found.st_mode & 0o077):
+        if not _is_private(found):
             raise PermissionError(f"{place} is not private to this user")
     return folder
 
@@ -202,6 +201,12 @@ def clear() -> int:
     return removed
 
 
+def _is_private(found: os.stat_result) -> bool:
+    """Whether a folder or file belongs to this user alone."""
+    # Windows keeps its profile folders private by other means.
+    return os.name != "posix" or (found.st_uid == os.geteuid() and not found.st_mode & 0o077)
+
+
 def _name(key: str) -> str:
     return hashlib.sha256(key.encode()).hexdigest()[:40] + SUFFIX
 
@@ -219,7 +224,7 @@ def _content(path: Path) -> bytes:
         found = os.fstat(file.fileno())
         if not stat.S_ISREG(found.st_mode):
             raise UntrustedProgramError(f"{path} is not a regular file")
-        if os.name == "posix" and (found.st_uid != os.geteuid() or found.st_mode & 0o077):
+        if not _is_private(found):
             raise UntrustedProgramError(f"{path} is not private to this user")
         return file.read()
 

@@ -45,11 +45,18 @@ from jaxtyping import Array, Bool, Float
 
 from jaxcal.model.batch import ImagePlanes, Iterate, barrier, choose, targets
 from jaxcal.model.distributions import FAMILIES, Family, OffsetLaw, Shape
-from jaxcal.model.observations import MediumPrior, Observation, OwnCovariances, Points, unit_shape
+from jaxcal.model.observations import (
+    MediumPrior,
+    Observation,
+    OwnCovariances,
+    Points,
+    rescaled,
+    unit_shape,
+)
 from jaxcal.model.parameters import retract
 from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
 from jaxcal.solvers import dense
-from jaxcal.solvers.evidence import NoiseModel, row_of, tune
+from jaxcal.solvers.evidence import NoiseModel, tune
 from jaxcal.solvers.expectation_propagation import (
     SITE_UNKNOWNS,
     Sites,
@@ -57,7 +64,7 @@ from jaxcal.solvers.expectation_propagation import (
     propagate,
     site_part,
 )
-from jaxcal.solvers.normal_equations import V_Y, stacked
+from jaxcal.solvers.normal_equations import V_Y, row_of, stacked
 from jaxcal.solvers.offset_mean import MEAN_SD, log_evidence_gain, mean_belief
 
 LARGEST_CHANGE = 0.4
@@ -305,10 +312,7 @@ def with_own_covariances(
     used, sigma = images.used, common.sigma
     shape, mean = unit_shape(variances, images)
     ratio = jnp.sqrt(mean / jnp.mean(mean, axis=0))
-    by = jnp.stack([ratio[0] * ratio[0], ratio[0] * ratio[1], ratio[1] * ratio[1]])
-    shape = jnp.where(
-        images.mask > 0, shape * by[..., None], jnp.asarray([1, 0, 1], shape.dtype)[:, None, None]
-    )
+    shape = rescaled(shape, ratio, images.mask > 0)
     scale = jnp.sqrt(0.5 * jnp.sum((sigma[:2] / ratio) ** 2, axis=0))
     tied = OwnCovariances(jnp.stack([scale, sigma[2]]), shape, jnp.ones_like(scale), tied=True)
     tuned = tune(common.iterate, tied, images, medium)
@@ -362,9 +366,7 @@ def median(
 
 
 def weights(
-    log_evidence: Float[Array, "k ..."],
-    change: Float[Array, "k ..."],
-    prior: Float[Array, " k"],
+    log_evidence: Float[Array, "k ..."], change: Float[Array, "k ..."], prior: Float[Array, " k"]
 ) -> tuple[Array, Array]:
     """The laws' probabilities, and which laws have finite results.
 

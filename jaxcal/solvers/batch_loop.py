@@ -18,8 +18,8 @@ from jaxtyping import Array, Bool
 State = TypeVar("State")
 
 LARGE_BATCH = 4096
-"""Batches of fewer problems stay whole. It is far above what a CPU solves side by side: the second
-loop is compiled, too."""
+"""Batches of fewer problems stay whole, since the second loop has to be compiled, too. A CPU solves
+far fewer side by side."""
 
 FEW = 16
 """The problems that go on alone are at most this share of the batch. On an H100, a pass over a

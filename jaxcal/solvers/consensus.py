@@ -39,10 +39,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxcal.data.problem import Problem
-from jaxcal.model.outlying import stands_out
+from jaxcal.model.outlying import robust_sd, stands_out, studentise, with_floor
 from jaxcal.model.parameters import Parameters, retract
 from jaxcal.model.residuals import measured_points, measurement_residual
-from jaxcal.model.thresholds import FEWEST_IMAGES, MAD, RELATIVE_FLOOR
+from jaxcal.model.thresholds import FEWEST_IMAGES
 from jaxcal.model.unknowns import Blocks, count_unknowns
 from jaxcal.solvers import dense
 from jaxcal.solvers.proposals import SUBSET, linear_proposals, nominal, subset_weights
@@ -63,9 +63,6 @@ a wider range, a third of the images that slipped together would pass for noise.
 HALVINGS = 24
 """How often the bracket about a median is halved: to a ten-millionth of the largest value."""
 
-Errors = Callable[[Parameters, Problem], Float[Array, "n 3"]]
-Propose = Callable[[Problem, Float[Array, "k n"]], Parameters]
-
 
 @dataclass(frozen=True)
 class ConsensusModel:
@@ -80,8 +77,8 @@ class ConsensusModel:
     """
 
     blocks: Blocks
-    errors: Errors
-    propose: Propose
+    errors: Callable[[Parameters, Problem], Float[Array, "n 3"]]
+    propose: Callable[[Problem, Float[Array, "k n"]], Parameters]
     isotropic: bool = False
     subset: int = SUBSET
 
@@ -152,7 +149,7 @@ def _finish(
         leverage = _leverage(jacobian, sigma, basis)
         squared = jnp.sum((errors / sigma) ** 2, axis=1)
         nearest = used * (squared <= quantile(squared, used, CONCENTRATION))
-        studentised = _studentise(errors, leverage, sigma, basis)
+        studentised = studentise(errors, leverage, sigma, basis)
         fits = used * ~stands_out(studentised, basis)
         # If fewer than ``fewest`` fit, go on with the images that stand out least.
         largest = jnp.max(jnp.abs(studentised), axis=1)
@@ -169,7 +166,7 @@ def _finish(
     errors, jacobian = linearise(parameters, problem, model)
     leverage = _leverage(jacobian, _robust(errors, keep, model), keep)
     sigma, freedom = _efficient(errors, leverage, keep, model)
-    studentised = _studentise(errors, leverage, sigma, keep)
+    studentised = studentise(errors, leverage, sigma, keep)
     # For images in use: the cost of three Gaussian errors each, less the freedom of the fitted
     # unknowns. For an image left out: each of its errors is as predicted or may be anything.
     cost = jnp.sum(freedom * jnp.log(jnp.sqrt(2 * jnp.pi * jnp.e) * sigma))
@@ -196,16 +193,15 @@ def studentised_errors(
     """
     errors, jacobian = linearise(parameters, problem, model)
     sigma = _robust(errors, keep, model)
-    return _studentise(errors, _leverage(jacobian, sigma, keep), sigma, keep)
+    return studentise(errors, _leverage(jacobian, sigma, keep), sigma, keep)
 
 
 def _robust(
     errors: Float[Array, "n 3"], weight: Float[Array, " n"], model: ConsensusModel
 ) -> Float[Array, " 3"]:
     """SDs of the components from the median magnitudes of the weighted images, mm."""
-    # The unknowns' degrees of freedom are shared equally by the three components.
-    freedom = jnp.maximum(1 - count_unknowns(model.blocks) / (3 * jnp.sum(weight)), 0.1)
-    return _with_floor(MAD * _medians(errors, weight, model) / jnp.sqrt(freedom))
+    medians = _medians(errors, weight, model)
+    return robust_sd(medians, jnp.sum(weight), count_unknowns(model.blocks))
 
 
 def _efficient(
@@ -223,20 +219,7 @@ def _efficient(
     if model.isotropic:
         squares, freedom = jnp.full(3, jnp.mean(squares)), jnp.full(3, jnp.mean(freedom))
     freedom = jnp.maximum(freedom, 0.1 * jnp.sum(weight))
-    return _with_floor(jnp.sqrt(squares / freedom)), freedom
-
-
-def _studentise(
-    errors: Float[Array, "n 3"],
-    leverage: Float[Array, "n 3"],
-    sigma: Float[Array, " 3"],
-    weight: Float[Array, " n"],
-) -> Float[Array, "n 3"]:
-    """Errors in SDs, corrected for leverage."""
-    # An image in use pulls the fit towards itself; an image left out is predicted by the fit.
-    inside = errors / jnp.sqrt(jnp.maximum(1 - leverage, 0.05))
-    outside = errors / jnp.sqrt(1 + leverage)
-    return jnp.where(weight[:, None] > 0, inside, outside) / sigma
+    return with_floor(jnp.sqrt(squares / freedom)), freedom
 
 
 def linearise(
@@ -317,8 +300,3 @@ def quantile(
 
     found = jax.lax.fori_loop(0, HALVINGS, halve, (jnp.zeros_like(high), high))[1]
     return jnp.where(jnp.sum(weight * (values <= high)) >= wanted, found, jnp.inf)
-
-
-def _with_floor(sigma: Float[Array, " 3"]) -> Float[Array, " 3"]:
-    """No SD below a fiftieth of the largest: smaller errors are no gross ones."""
-    return jnp.maximum(sigma, jnp.maximum(RELATIVE_FLOOR * jnp.max(sigma), 1e-6))

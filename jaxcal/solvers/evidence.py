@@ -29,7 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxcal.model.batch import ImagePlanes, Iterate, barrier, picked
+from jaxcal.model.batch import ImagePlanes, Iterate, barrier
 from jaxcal.model.observations import MediumPrior, Observation
 from jaxcal.runtime.compiler import traced_once
 from jaxcal.solvers import dense
@@ -37,9 +37,9 @@ from jaxcal.solvers.normal_equations import (
     V_Y,
     ComponentSums,
     component_sums,
-    pairs,
-    square_indices,
+    row_of,
     stacked,
+    traces,
 )
 from jaxcal.solvers.offset_mean import MEAN_SD, influences, log_evidence_gain, mean_belief, trust_in
 from jaxcal.solvers.reml import helmert, least_sigma
@@ -134,27 +134,14 @@ class System(eqx.Module):
 
     def traces(self, matrix: Float[Array, "q q batch"]) -> Float[Array, "k batch"]:
         """tr(A N_k) of every component, A symmetric."""
-        last = matrix.shape[0] - 1
-        rows, columns = (np.array(each) for each in zip(*pairs(last), strict=True))
-        twice = np.where(rows == columns, 1, 2).astype(matrix.dtype)[:, None]
-        flat = picked(matrix.reshape(-1, matrix.shape[-1]), (last + 1) * rows + columns)
-        found = jnp.sum(barrier(twice * flat) * self.sums.matrix, axis=1)
-        crossed = jnp.sum(2 * matrix[last, :last] * self.border[:last], axis=0)
-        own = crossed + matrix[last, last] * self.border[last]
+        found = traces(matrix, self.sums.matrix)
+        crossed = jnp.sum(2 * matrix[-1, :-1] * self.border[:-1], axis=0)
+        own = crossed + matrix[-1, -1] * self.border[-1]
         return found + np.eye(len(found), dtype=matrix.dtype)[-1][:, None] * own
 
 
-def row_of(flat: Float[Array, "triangle batch"], k: int) -> Float[Array, "p batch"]:
-    """A row of a symmetric matrix from its upper triangle."""
-    return picked(flat, square_indices(int((2 * flat.shape[0]) ** 0.5))[k])
-
-
 def tune(
-    iterate: Iterate,
-    observation: Observation,
-    images: ImagePlanes,
-    medium: MediumPrior | None,
-    rounds: int = ROUNDS,
+    iterate: Iterate, observation: Observation, images: ImagePlanes, medium: MediumPrior | None
 ) -> NoiseModel:
     """Tune the SDs, the unknowns and the mean from a nearby solution.
 
@@ -163,7 +150,6 @@ def tune(
         observation: with the SDs to start from, mm.
         images: the data.
         medium: prior of further unknowns, or None.
-        rounds: passes before the last one.
     """
     count, start = observation.count(images), observation.sigma
     # One floor for all rounds: where data are exact, a floor that followed a model's own offset SD
@@ -216,7 +202,7 @@ def tune(
         iterate, mean, sigma, trust, _ = state
         sums = sums_at(iterate)
         iterate, mean, sigma, trust = jax.lax.cond(
-            index < rounds,
+            index < ROUNDS,
             lambda: improved(sums, iterate, mean, sigma),
             lambda: (iterate, mean, sigma, trust),
         )
@@ -224,5 +210,5 @@ def tune(
 
     zero = jnp.zeros_like(start[0])
     state = (iterate, zero, start, zero + 1, none)
-    iterate, mean, sigma, trust, sums = jax.lax.fori_loop(0, rounds + 1, one_round, state)
+    iterate, mean, sigma, trust, sums = jax.lax.fori_loop(0, ROUNDS + 1, one_round, state)
     return NoiseModel(iterate, mean, sigma, sums, trust)

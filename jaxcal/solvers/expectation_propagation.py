@@ -47,7 +47,7 @@ from jaxtyping import Array, Float
 
 from jaxcal.model import unrolled
 from jaxcal.model.batch import barrier, picked, total
-from jaxcal.model.shapes import Family, Moments, tilted
+from jaxcal.model.shapes import Family, Interval, Moments, tilted
 from jaxcal.model.unknowns import RIGID_UNKNOWNS
 from jaxcal.model.unrolled import Matrix, Vector
 from jaxcal.runtime.compiler import traced_once
@@ -80,15 +80,13 @@ class Sites(eqx.Module):
         direction: h_i, in the order of z.
         offset: o_i, mm.
         used: 1 for used images.
-        lower: least u_i that is allowed, mm, or None.
-        upper: largest u_i that is allowed, mm, or None.
+        interval: where u_i may lie, or None.
     """
 
     direction: Vector
     offset: Float[Array, "batch n"]
     used: Float[Array, "batch n"]
-    lower: Float[Array, "batch n"] | None
-    upper: Float[Array, "batch n"] | None
+    interval: Interval | None
 
     @classmethod
     def of(
@@ -101,9 +99,9 @@ class Sites(eqx.Module):
     ) -> Sites:
         """From q_i and M_i, about a mean b of the offsets, within bounds on |q_iy|."""
         about = mean[:, None]
-        lower, upper = (None, None) if bound is None else (-bound - about, bound - about)
+        interval = None if bound is None else (-bound - about, bound - about)
         direction = [jnp.full_like(q[1], -1.0), q[2], -q[0], *tracker_to_image[1]]
-        return cls(direction, q[1] - about, used, lower, upper)
+        return cls(direction, q[1] - about, used, interval)
 
     @jax.jit
     def variance(self, covariance: Float[Array, "6 6 batch"]) -> Float[Array, "batch n"]:
@@ -247,7 +245,7 @@ def propagate(
             others starts with the sites of the law before it.
     """
     # Under the Gaussian law the first sites are exact, unless it is cut.
-    exact = [k for k, name in enumerate(families) if name == "gaussian" and sites.lower is None]
+    exact = [k for k, name in enumerate(families) if name == "gaussian" and sites.interval is None]
     swept: list[Family] = [name for k, name in enumerate(families) if k not in exact]
     names = tuple(dict.fromkeys(swept))
     turns: list[tuple[int, int, bool]] = []
@@ -372,10 +370,7 @@ class _Laws(eqx.Module):
         centre = shrink * (at - variance * nu)
         without = jnp.where(used > 0, variance * shrink, 1.0)
         centre, without = barrier((centre, without))
-        ways = [
-            partial(tilted, name, lower=self.sites.lower, upper=self.sites.upper)
-            for name in self.families
-        ]
+        ways = [partial(tilted, name, interval=self.sites.interval) for name in self.families]
         found = jax.lax.switch(family, ways, sd, centre, without)
 
         # The evidence is stationary in the sites, so it is as good before the last sweep as after.

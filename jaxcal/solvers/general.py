@@ -22,6 +22,7 @@ section 6.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -48,36 +49,39 @@ from jaxcal.solvers.normal_equations import NormalEquations
 from jaxcal.solvers.plan import MOST_STEPS
 
 
-class Flat(eqx.Module):
-    """Unknowns of one problem as a vector, and a local unknown a row where there are some.
+class Local(eqx.Module):
+    """One local unknown a row, and how they follow a step dx of the shared ones.
 
     Attributes:
-        shared: the unknowns.
-        local: a row's own; None where there are none.
-        slope: how the local unknowns follow a step: by dy = -(rest + slope dx).
+        value: the unknowns y.
+        slope: they move by dy = -(rest + slope dx).
         rest: the part of -dy that does not depend on dx.
-        limit: largest magnitude of the local unknowns.
-        local_cosine: gradient cosine of the local unknowns, the largest of all rows, where the
-            derivatives were last taken.
+        limit: largest magnitude of y.
+        cosine: their gradient cosine, the largest of all rows, where the derivatives were last
+            taken.
     """
 
+    value: Float[Array, "n 1"]
+    slope: Float[Array, "n p 1"]
+    rest: Float[Array, "n 1"]
+    limit: Float[Array, "n 1"]
+    cosine: Float[Array, " 1"]
+
+    def moved(self, step: Float[Array, "p 1"]) -> Local:
+        """After a step of the shared unknowns."""
+        along = self.value - self.rest - jnp.sum(self.slope * step, axis=1)
+        return replace(self, value=jnp.clip(along, -self.limit, self.limit))
+
+
+class Flat(eqx.Module):
+    """Unknowns of one problem: the shared ones as a vector, and the local ones if there are any."""
+
     shared: Float[Array, "p 1"]
-    local: Float[Array, "n 1"] | None = None
-    slope: Float[Array, "n p 1"] | None = None
-    rest: Float[Array, "n 1"] | None = None
-    limit: Float[Array, "n 1"] | None = None
-    local_cosine: Float[Array, " 1"] | None = None
+    local: Local | None = None
 
     def moved(self, step: Float[Array, "p 1"]) -> Flat:
         """After a step of the shared unknowns."""
-        local = self.local
-        if local is not None:
-            assert self.slope is not None
-            assert self.rest is not None
-            assert self.limit is not None
-            along = local - self.rest - jnp.sum(self.slope * step, axis=1)
-            local = jnp.clip(along, -self.limit, self.limit)
-        return Flat(self.shared + step, local, self.slope, self.rest, self.limit, self.local_cosine)
+        return Flat(self.shared + step, None if self.local is None else self.local.moved(step))
 
 
 class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
@@ -158,15 +162,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         return done, result
 
     def postprocess(
-        self,
-        fn: Any,
-        y: Any,
-        aux: Any,
-        args: Any,
-        options: Any,
-        state: Any,
-        tags: Any,
-        result: optx.RESULTS,
+        self, fn: Any, y: Any, aux: Any, args: Any, options: Any, state: Any, tags: Any, result: Any
     ) -> tuple[Any, Any, dict[str, Any]]:
         return y, aux, {}
 
@@ -234,11 +230,7 @@ def arrow_least_squares(
         raise InputError(f"residual must return a ({rows or 'n'}, columns) array, not {got}")
     bound = _bound(limit, rows).astype(flat.dtype)
 
-    solver = _ArrowSolver(
-        tolerance=tolerance,
-        damping=damping,
-        limit=bound,
-    )
+    solver = _ArrowSolver(tolerance=tolerance, damping=damping, limit=bound)
     function = _FlatResidual(residual, unravel)
     solution = optx.least_squares(function, solver, first, args, max_steps=max_steps, throw=throw)
     found = solution.value
@@ -279,7 +271,7 @@ class _ArrowSolver(LevenbergMarquardt):
     def step(self, fn: Any, y: Any, args: Any, options: Any, state: Any, tags: Any) -> tuple:
         descent, rounding, aux = state
         here = descent.candidate
-        at = here.shared[:, 0], here.local[:, 0]
+        at = here.shared[:, 0], here.local.value[:, 0]
         candidate, normal = self._at(fn, at, args, descent.damping)
         # The candidate's own derivatives say how its local unknowns follow the next step.
         descent = eqx.tree_at(lambda state: state.candidate, descent, candidate)
@@ -290,7 +282,7 @@ class _ArrowSolver(LevenbergMarquardt):
         iterate = after.iterate
         # A step knows of the shared unknowns' gradient alone. Where that is zero, the local ones
         # may be far from their minimum still.
-        still = iterate.local_cosine
+        still = iterate.local.cosine
         stopped = (after.stalled >= MOST_STALLED) | (after.damping > LARGEST_DAMPING)
         after = eqx.tree_at(
             lambda state: (state.active, state.converged),
@@ -300,7 +292,7 @@ class _ArrowSolver(LevenbergMarquardt):
                 after.converged & ((still <= 10 * tolerance) | (after.stalled >= MOST_STALLED)),
             ),
         )
-        return (iterate.shared[:, 0], iterate.local[:, 0]), (after, rounding, aux), aux
+        return (iterate.shared[:, 0], iterate.local.value[:, 0]), (after, rounding, aux), aux
 
     def _at(
         self, fn: Any, y: tuple[Array, Array], args: Any, damping: Array | float
@@ -332,12 +324,11 @@ class _ArrowSolver(LevenbergMarquardt):
             cost,
             jnp.diagonal(shared),
         )
-        iterate = Flat(
-            y[0][:, None],
-            y[1][:, None],
-            (give[:, None] * coupling)[..., None],
-            (give * pull)[:, None],
-            self.limit[:, None],
-            jnp.max(cosine, initial=0.0)[None],
+        local = Local(
+            value=y[1][:, None],
+            slope=(give[:, None] * coupling)[..., None],
+            rest=(give * pull)[:, None],
+            limit=self.limit[:, None],
+            cosine=jnp.max(cosine, initial=0.0)[None],
         )
-        return iterate, normal
+        return Flat(y[0][:, None], local), normal

@@ -136,11 +136,7 @@ def observe(
 
 
 def run(
-    begun: ConventionalStart,
-    problems: Problem,
-    images: ImagePlanes,
-    given: Given,
-    plan: SolvePlan,
+    begun: ConventionalStart, problems: Problem, images: ImagePlanes, given: Given, plan: SolvePlan
 ) -> Solution:
     """The plan's method from conventional fits."""
     observation, medium = observe(problems, images, given, plan)

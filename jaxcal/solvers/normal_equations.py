@@ -38,7 +38,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxcal.model import derivatives, unrolled
-from jaxcal.model.batch import ImagePlanes, Iterate, picked, targets, total
+from jaxcal.model.batch import ImagePlanes, Iterate, barrier, picked, targets, total
 from jaxcal.model.observations import (
     Component,
     FurtherUnknowns,
@@ -72,6 +72,39 @@ def square_indices(unknowns: int) -> np.ndarray:
     for index, (i, j) in enumerate(pairs(unknowns)):
         indices[i, j] = indices[j, i] = index
     return indices
+
+
+def diagonal_indices(unknowns: int) -> np.ndarray:
+    """Index in a flat upper triangle of every entry of the diagonal."""
+    return square_indices(unknowns).diagonal()
+
+
+def unknowns_of(flat: Float[Array, "*k triangle batch"]) -> int:
+    """Number of rows of the matrix whose upper triangle this is."""
+    return int((2 * flat.shape[-2]) ** 0.5)
+
+
+def stacked(flat: Float[Array, "triangle batch"]) -> Float[Array, "p p batch"]:
+    """A symmetric matrix from its upper triangle."""
+    return picked(flat, square_indices(unknowns_of(flat)))
+
+
+def row_of(flat: Float[Array, "triangle batch"], k: int) -> Float[Array, "p batch"]:
+    """A row of a symmetric matrix from its upper triangle."""
+    return picked(flat, square_indices(unknowns_of(flat))[k])
+
+
+def traces(
+    matrix: Float[Array, "q q batch"], flat: Float[Array, "k triangle batch"]
+) -> Float[Array, "k batch"]:
+    """tr(A N_k) of a symmetric A and N_k given by their upper triangles.
+
+    Where A has more rows than N_k, its first ones count.
+    """
+    rows, columns = np.triu_indices(unknowns_of(flat))
+    twice = np.where(rows == columns, 1, 2).astype(matrix.dtype)[:, None]
+    entries = picked(matrix.reshape(-1, matrix.shape[-1]), len(matrix) * rows + columns)
+    return jnp.sum(barrier(twice * entries) * flat, axis=1)
 
 
 class Term(eqx.Module):
@@ -159,15 +192,13 @@ def _derive(
 
 
 def over_elements(plane: Entry) -> Entry:
-    """A plane with an axis of elements summed over them."""
+    """A plane (batch, n, elements) summed over the elements; other planes as they are."""
     return plane if unrolled.is_zero(plane) or plane.ndim < 3 else jnp.sum(plane, axis=2)
 
 
 def weight_of(component: Component, images: ImagePlanes) -> Array:
-    """1 for every residual that is there."""
-    if component.errors[0].ndim < 3:
-        return images.mask if component.present is None else images.mask * component.present
-    mask = images.mask[..., None]
+    """1 where there is a residual, 0 elsewhere."""
+    mask = images.mask if component.errors[0].ndim < 3 else images.mask[..., None]
     return mask if component.present is None else mask * component.present
 
 
@@ -381,18 +412,7 @@ class NormalEquations(eqx.Module):
         """|J_k|^2 of every unknown: what damping and the gradient cosine are relative to."""
         if self.column_squares is not None:
             return self.column_squares
-        indices = diagonal_indices(self.gradient.shape[0])
-        return picked(self.curvature, np.array(indices))
-
-
-def stacked(flat: Float[Array, "triangle batch"]) -> Float[Array, "p p batch"]:
-    """A symmetric matrix from its upper triangle."""
-    return picked(flat, square_indices(int((2 * flat.shape[0]) ** 0.5)))
-
-
-def diagonal_indices(unknowns: int) -> tuple[int, ...]:
-    """Indices of the diagonal in a flat upper triangle."""
-    return tuple(pairs(unknowns).index((k, k)) for k in range(unknowns))
+        return picked(self.curvature, diagonal_indices(self.gradient.shape[0]))
 
 
 def accumulate(
@@ -417,25 +437,23 @@ def accumulate(
         eliminated.
     """
     q, tracker_to_image = targets(iterate, images)
-    wide = None if exact is None else exact[:, None]
+    wide = 0 if exact is None else exact[:, None]
     derived = _derive(observation, q, tracker_to_image, iterate, images, exact=exact is not None)
     weights = [(1 / (sd * sd))[:, None] for sd in observation.sigma]
     count = len(derived.components)
     term = _weighted_sum([_gauss_newton(derived, k, images) for k in range(count)], weights)
-    whole, own_bend = term, term.curvature[-1][-1]
-    if wide is not None:
+    plain = term
+    if exact is not None:
         bent = [_second_order(derived, k, images) for k in range(count)]
         gated = [wide * weight for weight in weights]
         term = Term(term.cost, term.gradient, _summed([term.curvature, *bent], [1, *gated]))
     indices = diagonal_indices(iterate.unknowns)
     columns: Vector = []
     if derived.free is not None:
-        every, _ = contributions(q, tracker_to_image, _shared(whole), derived.unknowns, 0)
+        every, _ = contributions(q, tracker_to_image, _shared(plain), derived.unknowns, 0)
         columns = [every[k] for k in indices]
-        term = _eliminated(term, own_bend, derived.free)
-    curvature, gradient = contributions(
-        q, tracker_to_image, term, derived.unknowns, 0 if wide is None else wide
-    )
+        term = _eliminated(term, plain.curvature[-1][-1], derived.free)
+    curvature, gradient = contributions(q, tracker_to_image, term, derived.unknowns, wide)
     cost, *sums = total([term.cost, *curvature, *gradient, *columns])
     flat, gradient = sums[: len(curvature)], sums[len(curvature) : len(curvature) + len(gradient)]
     squares = sums[len(curvature) + len(gradient) :]

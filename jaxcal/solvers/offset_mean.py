@@ -161,9 +161,7 @@ def influences(
 
 
 def trust_in(
-    variance: Float[Array, " batch"],
-    moved: Float[Array, "batch n"],
-    share: Float[Array, "batch n"],
+    variance: Float[Array, " batch"], moved: Float[Array, "batch n"], share: Float[Array, "batch n"]
 ) -> Float[Array, " batch"]:
     """The variance of b under the model over the variance that the images show, at most one.
 

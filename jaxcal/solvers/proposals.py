@@ -21,7 +21,8 @@ from jaxcal.model.unknowns import Blocks
 from jaxcal.solvers import dense
 
 MOST_PROPOSALS, FEWEST_PROPOSALS = 512, 256
-"""If a third of a dozen images are outliers, one subset in 33 is clean."""
+"""Bounds on the number of subsets. If a third of a dozen images are outliers, one subset in 33 is
+clean."""
 SUBSET = 6
 """Images in a proposal's subset: four determine the linear system, two more steady it."""
 SEED = 20261121

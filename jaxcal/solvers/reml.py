@@ -35,7 +35,6 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxcal.model.batch import ImagePlanes, Iterate, barrier, choose
@@ -60,8 +59,8 @@ from jaxcal.solvers.normal_equations import (
     ComponentSums,
     NormalEquations,
     component_sums,
-    pairs,
     stacked,
+    traces,
 )
 
 RELATIVE_FLOOR = 1e-3
@@ -166,15 +165,8 @@ def updated(
     ridge = 16 * jnp.finfo(count.dtype).eps * jnp.where(diagonal > 0, diagonal, 1.0)
     eye = jnp.eye(len(diagonal), dtype=diagonal.dtype)[..., None]
     inverse, _ = dense.inverse_batch_last(stacked(normal.curvature) + eye * ridge)
-    entries = pairs(len(diagonal))
-    twice = np.array([1 if i == j else 2 for i, j in entries], diagonal.dtype)[:, None]
-
-    def flat(matrix: Float[Array, "p p batch"]) -> Float[Array, "triangle batch"]:
-        rows, columns = (np.array(each) for each in zip(*entries, strict=True))
-        return barrier(twice * matrix[rows, columns])
-
-    leverage = jnp.sum(flat(inverse) * sums.matrix, axis=1)
-    bent = jnp.sum(flat(move[:, None] * move) * sums.matrix, axis=1)
+    leverage = traces(inverse, sums.matrix)
+    bent = traces(move[:, None] * move, sums.matrix)
     left = sums.squares + 2 * jnp.sum(sums.gradient * move, axis=1) + bent
     return with_floor(helmert(left, leverage, count, sigma))
 

@@ -125,22 +125,17 @@ def _with_rotation(reduced: ReducedBatch, lateral: Array, axial: Array, blocks: 
 
 def _scales(reduced: ReducedBatch, lateral: Array, axial: Array) -> Float[Array, "2 batch"]:
     """The scales that fit best, given two columns of a rotation."""
-    forces = [
-        dense.product_batch_last(reduced.matrix[:, :3], lateral),
-        dense.product_batch_last(reduced.matrix[:, 3:], axial),
-    ]
-    first, mixed, second = (
-        jnp.sum(lateral * forces[0][:3], axis=0),
-        jnp.sum(axial * forces[0][3:], axis=0),
-        jnp.sum(axial * forces[1][3:], axis=0),
-    )
+    # The normal equations of the two scales, of which a1 and a3 are the multiples.
+    by_lateral = dense.product_batch_last(reduced.matrix[:, :3], lateral)
+    by_axial = dense.product_batch_last(reduced.matrix[3:, 3:], axial)
+    first = jnp.sum(lateral * by_lateral[:3], axis=0)
+    mixed = jnp.sum(axial * by_lateral[3:], axis=0)
+    second = jnp.sum(axial * by_axial, axis=0)
     ridge = 16 * jnp.finfo(first.dtype).eps
     held = jnp.where(reduced.squares > 0, ridge * reduced.squares, 1.0)
     first, second = first + held[0], second + held[1]
-    right, deep = (
-        jnp.sum(lateral * reduced.rhs[:3], axis=0),
-        jnp.sum(axial * reduced.rhs[3:], axis=0),
-    )
+    right = jnp.sum(lateral * reduced.rhs[:3], axis=0)
+    deep = jnp.sum(axial * reduced.rhs[3:], axis=0)
     determinant = first * second - mixed * mixed
     return jnp.stack([second * right - mixed * deep, first * deep - mixed * right]) / determinant
 

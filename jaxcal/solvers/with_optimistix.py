@@ -17,12 +17,7 @@ from jaxcal.model.batch import ImagePlanes, Iterate, choose, targets
 from jaxcal.model.observations import FurtherUnknowns, MediumPrior, Observation
 from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
 from jaxcal.runtime.compiler import traced_once
-from jaxcal.solvers.levenberg_marquardt import (
-    Minimum,
-    Rounding,
-    empty_trace,
-    gradient_cosine,
-)
+from jaxcal.solvers.levenberg_marquardt import Minimum, Rounding, empty_trace, gradient_cosine
 from jaxcal.solvers.normal_equations import accumulate, component_sums, weight_of
 from jaxcal.solvers.plan import Options
 from jaxcal.solvers.reml import update_at, with_floor

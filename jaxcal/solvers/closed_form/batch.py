@@ -53,9 +53,10 @@ CHUNK = 256
 """Problems in one call of the compiled program."""
 
 FEW = 1024
-"""So many problems are solved one by one, in about a second; to compile takes six."""
+"""Up to so many problems are solved one by one, in about a second; compiling takes six."""
 
 NEWTON_STEPS = 30
+"""Most steps of Newton's method on the dual."""
 MET = 500
 """Constraints are met when they are off by less than this many roundings of |x|^2."""
 SHORTER = 0.25
@@ -80,7 +81,7 @@ def solve_batch(problems: Problem, estimate: tuple[str, ...], *, few: int = FEW)
         InputError: unknown names, a scale where there is none, or a transformation that began
             without JAX's 64 bits.
     """
-    check_estimate(estimate, problems.pixels, problems.spacing_known)
+    check_estimate(estimate, problems)
     problems = replace(
         problems, covariance=None, max_elevation=None, channels=None, sound_speed=None, delay=None
     )
@@ -94,11 +95,6 @@ def solve_batch(problems: Problem, estimate: tuple[str, ...], *, few: int = FEW)
         flat = map_arrays(lambda leaf: np.asarray(leaf, np.float64), flat)
         answer = _concrete(flat, estimate, few)
     return map_arrays(lambda leaf: leaf.reshape((*shape, *leaf.shape[1:])), answer)
-
-
-_compiled = jax.jit(
-    lambda problems, estimate: solve_traceable(problems, estimate), static_argnums=1
-)
 
 
 def _concrete(problems: Problem, estimate: tuple[str, ...], few: int) -> ClosedForm:
@@ -191,12 +187,11 @@ def solve_traceable(problems: Problem, estimate: tuple[str, ...]) -> ClosedForm:
     # All that fits as well lies in a ball about the dual's minimiser (as in ``certify_point``).
     ball = 4 * (gap + rounding * size)
     alone = ball <= NEARBY**2 * least * jnp.sum(x * x, axis=0)
+    scale = problems.spacing * lengths.T if scaled else problems.spacing
     return ClosedForm(
         image_to_probe=transform,
         point_mm=(reduced.centre + target).T,
-        scale_mm_per_px=problems.spacing * (lengths.T if scaled else 1.0)
-        if problems.pixels
-        else None,
+        scale_mm_per_px=scale if problems.pixels else None,
         sound_speed_factor=lengths[1] if constraints.free == ("axial",) else jnp.ones_like(count),
         rms_mm=jnp.sqrt(objective / count),
         objective_mm2=objective,
@@ -205,6 +200,9 @@ def solve_traceable(problems: Problem, estimate: tuple[str, ...]) -> ClosedForm:
         # M is positive definite, and so are the normal equations of t and c.
         unique=certified & alone,
     )
+
+
+_compiled = jax.jit(solve_traceable, static_argnums=1)
 
 
 def _rows(stacked: Array) -> Matrix:
@@ -238,9 +236,7 @@ def _off(constraints: QuadraticConstraints, x: Vector) -> Vector:
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _optimum(
-    estimate: tuple[str, ...],
-    matrix: Float[Array, "6 6 batch"],
-    vector: Float[Array, "6 batch"],
+    estimate: tuple[str, ...], matrix: Float[Array, "6 6 batch"], vector: Float[Array, "6 batch"]
 ) -> tuple[Float[Array, "6 batch"], Float[Array, "k batch"]]:
     """The x and the multipliers at the dual's maximum, by Newton's method; NaN where that fails."""
     constraints = CONSTRAINTS[estimate]

@@ -7,6 +7,7 @@ where that proves nothing, the one of :mod:`jaxcal.solvers.closed_form.rotation_
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -17,17 +18,20 @@ from jaxcal.model.unknowns import unknown_names
 from jaxcal.runtime.array_types import AnyArray, Float
 from jaxcal.runtime.arrays import is_traced
 from jaxcal.runtime.given_values import real_array
+from jaxcal.runtime.messages import shown
 from jaxcal.solvers.closed_form.reduced_objective import (
     Certificate,
+    QuadraticConstraints,
     certify_point,
     image_data,
     reduce,
     tolerance,
 )
 from jaxcal.solvers.closed_form.rotation_relaxation import lower_bound
+from jaxcal.solvers.plan import check_size
 
 ORTHONORMAL = 1e-6
-"""A transform whose rotation stretches by more is refused; less is rounding, and is removed."""
+"""A rotation or a scale that stretches by more is refused; less is rounding, and is removed."""
 
 
 def certify(
@@ -55,7 +59,8 @@ def certify(
         minimises; joint methods minimise another one.
 
     Raises:
-        InputError: data that cannot be used, no rotation, a wanted scale that is missing, or traced
+        InputError: data that cannot be used, no rotation, a wanted scale that is missing, a scale
+            or sound speed other than the nominal one that ``estimate`` does not name, or traced
             arrays.
     """
     if is_traced(problem, image_to_probe, point, scale_mm_per_px, sound_speed_factor):
@@ -66,13 +71,11 @@ def certify(
     transform = real_array(image_to_probe, "image_to_probe")
     if transform.shape != (4, 4) or not np.isfinite(transform).all():
         raise InputError("image_to_probe must be a finite 4x4 matrix, in mm")
-    factors = np.array([1.0, sound_speed_factor])
-    if constraints.scaled:
-        if scale_mm_per_px is None:
-            raise InputError("an estimated scale belongs to the answer: give scale_mm_per_px")
-        factors = real_array(scale_mm_per_px, "scale_mm_per_px") / data.spacing
-    if point is not None and np.shape(point) != (3,):
-        raise InputError(f"point must have shape (3,), not {np.shape(point)}")
+    factors = _factors(constraints, data.spacing, scale_mm_per_px, sound_speed_factor)
+    if point is not None:
+        point = real_array(point, "point")
+        if point.shape != (3,) or not np.isfinite(point).all():
+            raise InputError("point must be 3 finite numbers, in mm")
     left, stretch, right = np.linalg.svd(transform[:3, :3])
     if np.abs(stretch - 1).max() > ORTHONORMAL or np.linalg.det(left @ right) < 0:
         raise InputError("image_to_probe holds no rotation: its columns are not orthonormal")
@@ -80,12 +83,10 @@ def certify(
     x = np.concatenate([factors[0] * rotation[:, 0], factors[1] * rotation[:, 2]])
     if constraints.scaled:
         origin = origin + data.face_offset * rotation[:, 2]
-    seen = data.points.copy()
-    if not constraints.scaled:
-        seen[:, 1] += data.face_offset
+    seen = data.factors_of(constraints)
     in_probe = seen[:, :1] * x[:3] + seen[:, 1:] * x[3:] + origin
     cloud = np.einsum("nij,nj->ni", data.rotations, in_probe) + data.translations
-    target = cloud.mean(axis=0) if point is None else real_array(point, "point")
+    target = cloud.mean(axis=0) if point is None else point
     value = float(np.sum((cloud - target) ** 2))
     excess = max(value - float(reduced(x)), 0.0)
     found = certify_point(reduced, x, excess=excess)
@@ -94,3 +95,34 @@ def certify(
     relaxed = lower_bound(reduced, x, 0.3 * tolerance(reduced, found.objective_mm2))
     gap = np.inf if relaxed is None else relaxed.gap
     return certify_point(reduced, x, excess=excess, gap=gap)
+
+
+def _factors(
+    constraints: QuadraticConstraints,
+    spacing: Float[np.ndarray, " 2"],
+    scale_mm_per_px: Any,
+    sound_speed_factor: Any,
+) -> Float[np.ndarray, " 2"]:
+    """The answer's factors on lateral position and range; the bound needs those that are allowed.
+
+    Raises:
+        InputError: they are not, or are no such numbers.
+    """
+    tiny = np.finfo(float).tiny
+    check_size("sound_speed_factor", sound_speed_factor, tiny, unit="")
+    factors = np.array([1.0, sound_speed_factor], float)
+    if constraints.free != ("axial",) and abs(factors[1] - 1) > ORTHONORMAL:
+        raise InputError('a sound_speed_factor other than 1 needs estimate=("sound-speed",)')
+    if constraints.scaled:
+        if scale_mm_per_px is None:
+            raise InputError("an estimated scale belongs to the answer: give scale_mm_per_px")
+        check_size("scale_mm_per_px", scale_mm_per_px, tiny, one=False, unit="mm")
+        if np.shape(scale_mm_per_px) != (2,):
+            raise InputError(f"scale_mm_per_px must be 2 numbers, not {shown(scale_mm_per_px)}")
+        factors = real_array(scale_mm_per_px, "scale_mm_per_px") / spacing
+    if constraints.free == ("common",) and abs(factors[1] / factors[0] - 1) > ORTHONORMAL:
+        raise InputError(
+            "a common scale is one factor on lateral and axial spacing, and these are two: "
+            'estimate=("scale",) has two'
+        )
+    return constraints.allowed(factors)

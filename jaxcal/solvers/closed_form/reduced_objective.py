@@ -39,7 +39,7 @@ import numpy as np
 from jaxcal import InputError
 from jaxcal.data.problem import Problem
 from jaxcal.data.recording import MINIMUM_IMAGES
-from jaxcal.runtime.array_types import Bool, Float
+from jaxcal.runtime.array_types import Float
 
 RANK_TOLERANCE = 1e-11
 """Singular values below this share of the largest possible one count as zero."""
@@ -79,6 +79,14 @@ class QuadraticConstraints:
     def scaled(self) -> bool:
         """Whether pixel sizes are unknown; they do not stretch the range of row 0."""
         return bool({"lateral", "common"} & set(self.free))
+
+    def allowed(self, lengths: Float[np.ndarray, " 2"]) -> Float[np.ndarray, " 2"]:
+        """The lengths of a1 and a3 that the constraints allow, nearest to the given ones."""
+        return {
+            (): np.ones(2),
+            ("common",): np.full(2, lengths.mean()),
+            ("axial",): np.array([1.0, lengths[1]]),
+        }.get(self.free, lengths)
 
 
 def _constraints() -> dict[tuple[str, ...], QuadraticConstraints]:
@@ -121,6 +129,13 @@ class ImageData:
     face_offset: float
     spacing: Float[np.ndarray, " 2"]
     pixels: bool
+
+    def factors_of(self, constraints: QuadraticConstraints) -> Float[np.ndarray, "n 2"]:
+        """What a1 and a3 multiply, mm.
+
+        A sound speed multiplies the whole range, a pixel scale only what was measured in pixels.
+        """
+        return self.points + np.array([0.0, 0.0 if constraints.scaled else self.face_offset])
 
 
 @dataclass(frozen=True)
@@ -170,24 +185,35 @@ def image_data(
     """The images in use and the constraints.
 
     Raises:
-        InputError: unknown names, a scale where there is none, or unusable images.
+        InputError: unknown names, a scale where there is none; NaN, Inf, or fewer than 4 used
+            images.
     """
-    check_estimate(estimate, problem.pixels, problem.spacing_known)
-    mask = np.asarray(problem.mask)
+    check_estimate(estimate, problem)
+    mask = np.asarray(problem.mask) > 0
     if mask.ndim != 1:
         raise InputError(f"one problem is wanted, not a batch with axes {mask.shape[:-1]}")
-    data = used_images(
-        np.asarray(problem.poses, dtype=float),
-        np.asarray(problem.measurements, dtype=float),
-        mask > 0,
-        np.asarray(problem.spacing, dtype=float),
-        float(problem.face_offset),
-        problem.pixels,
+    count = np.count_nonzero(mask)
+    if count < MINIMUM_IMAGES:
+        raise InputError(f"{count} used images are too few: at least {MINIMUM_IMAGES} are needed")
+    poses = np.asarray(problem.poses, dtype=float)
+    measurements = np.asarray(problem.measurements, dtype=float)
+    for name, values in (("poses", poses), ("measurements", measurements)):
+        bad = mask & ~np.isfinite(values).reshape(len(mask), -1).all(axis=1)
+        if bad.any():
+            raise InputError(f"{name} of image {np.flatnonzero(bad)[0]} hold NaN or Inf")
+    spacing = np.asarray(problem.spacing, dtype=float)
+    data = ImageData(
+        rotations=poses[mask, :3, :3],
+        translations=poses[mask, :3, 3],
+        points=measurements[mask] * spacing,
+        face_offset=float(problem.face_offset),
+        spacing=spacing,
+        pixels=problem.pixels,
     )
     return data, CONSTRAINTS[estimate]
 
 
-def check_estimate(estimate: tuple[str, ...], pixels: bool, spacing_known: bool) -> None:
+def check_estimate(estimate: tuple[str, ...], problem: Problem) -> None:
     """Refuse an ``estimate`` without a closed form, and scales that do not exist or are not known.
 
     Raises:
@@ -197,35 +223,10 @@ def check_estimate(estimate: tuple[str, ...], pixels: bool, spacing_known: bool)
         named = " or ".join(repr(key) for key in CONSTRAINTS)
         raise InputError(f"no closed form for estimate={estimate!r}; there is one for {named}")
     scaled = bool({"scale", "common-scale"} & set(estimate))
-    if scaled and not pixels:
+    if scaled and not problem.pixels:
         raise InputError("the points are in mm already: there is no pixel scale to estimate")
-    if not scaled and not spacing_known:
+    if not scaled and not problem.spacing_known:
         raise InputError('the pixels have no spacing_mm: give it, or estimate=("scale",)')
-
-
-def used_images(
-    poses: Float[np.ndarray, "n 4 4"],
-    measurements: Float[np.ndarray, "n 2"],
-    mask: Bool[np.ndarray, " n"],
-    spacing: Float[np.ndarray, " 2"],
-    face_offset: float,
-    pixels: bool,
-) -> ImageData:
-    """Arrays without the images that are left out.
-
-    Raises:
-        InputError: NaN, Inf, or fewer than 4 used images.
-    """
-    count = np.count_nonzero(mask)
-    if count < MINIMUM_IMAGES:
-        raise InputError(f"{count} used images are too few: at least {MINIMUM_IMAGES} are needed")
-    for name, values in (("poses", poses), ("measurements", measurements)):
-        bad = mask & ~np.isfinite(values).reshape(len(mask), -1).all(axis=1)
-        if bad.any():
-            raise InputError(f"{name} of image {np.flatnonzero(bad)[0]} hold NaN or Inf")
-    used = poses[mask]
-    points = measurements[mask] * spacing
-    return ImageData(used[:, :3, :3], used[:, :3, 3], points, face_offset, spacing, pixels)
 
 
 def reduce(data: ImageData, constraints: QuadraticConstraints) -> ReducedObjective:
@@ -235,10 +236,7 @@ def reduce(data: ImageData, constraints: QuadraticConstraints) -> ReducedObjecti
     their digits where the data are exact or the poses nearly degenerate.
     """
     count = len(data.points)
-    points = data.points.copy()
-    # A sound speed multiplies the whole range, a pixel scale only what was measured in pixels.
-    if not constraints.scaled:
-        points[:, 1] += data.face_offset
+    points = data.factors_of(constraints)
     mean, centre = points.mean(axis=0), data.translations.mean(axis=0)
     points -= mean
     away = data.translations - centre

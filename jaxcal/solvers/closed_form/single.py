@@ -305,12 +305,7 @@ def feasible(
     lengths = np.linalg.norm(pair, axis=0)
     lengths = np.where(lengths > 0, lengths, 1.0)
     left, _, right = np.linalg.svd(pair / lengths, full_matrices=False)
-    lengths = {
-        (): np.ones(2),
-        ("common",): np.full(2, lengths.mean()),
-        ("axial",): np.array([1.0, lengths[1]]),
-    }.get(constraints.free, lengths)
-    return ((left @ right) * lengths).T.ravel()
+    return ((left @ right) * constraints.allowed(lengths)).T.ravel()
 
 
 @cache
@@ -319,7 +314,7 @@ def _rotations() -> Float[np.ndarray, "60 3 3"]:
     golden = (1 + 5**0.5) / 2
     unit = [np.array(q) for q in itertools.product((0.5, -0.5), repeat=4)]
     unit += [np.roll([1.0, 0.0, 0.0, 0.0], k) for k in range(4)]
-    even = [p for p in itertools.permutations(range(4)) if _parity(p) == 0]
+    even = [p for p in itertools.permutations(range(4)) if np.linalg.det(np.eye(4)[list(p)]) > 0]
     for signs in itertools.product((0.5, -0.5), repeat=3):
         base = np.array([signs[0] * golden, signs[1], signs[2] / golden, 0.0])
         unit += [base[list(p)] for p in even]
@@ -328,12 +323,6 @@ def _rotations() -> Float[np.ndarray, "60 3 3"]:
         if not any(abs(abs(q @ other) - 1) < 1e-9 for other in found):
             found.append(q)
     return rotations_from_quaternions(np.array(found), "wxyz")
-
-
-def _parity(permutation: tuple[int, ...]) -> int:
-    """0 for an even permutation, 1 for an odd one."""
-    pairs = itertools.combinations(permutation, 2)
-    return sum(a > b for a, b in pairs) % 2
 
 
 def _scale_columns(
