@@ -43,6 +43,7 @@ from jaxcal.diagnostics.unmodelled import unmodelled
 from jaxcal.model.image_points import distance, mean_of_squares
 from jaxcal.report.contradictions import contradictions
 from jaxcal.result.calibration import Calibration
+from jaxcal.result.saved import ASKED_FOR
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.given_values import real_array
 from jaxcal.solvers.closed_form.single import solve_problem
@@ -139,7 +140,7 @@ def _tre(
             raise InputError(f"tre_points must be pairs of numbers, not of shape {given.shape}")
         if not (np.abs(given) <= LARGEST).all():
             raise InputError(f"points of --tre must be numbers up to {LARGEST:g}")
-        names += ("asked for",) * len(given)
+        names += (ASKED_FOR,) * len(given)
         image = np.concatenate([image, given])
         places = np.concatenate([places, transform._in_plane(given)[:, [0, 2]]])
     at = tre_at(answer, places)

@@ -25,6 +25,9 @@ FORMAT = "jaxcal-calibration"
 VERSION = 1
 MAXIMUM_BYTES = 64 * 2**20
 
+ASKED_FOR = "asked for"
+"""Name of those points of ``tre`` that a caller named; all others are of the region."""
+
 _IN_THE_PLANE = ("scale_mm_per_px", "face_offset_mm", "range_factor")
 """What takes an image point to the image plane; no part of the rigid transform."""
 
@@ -316,17 +319,19 @@ def load_calibration(path: str | os.PathLike[str]) -> ImageTransform:
 
 
 def stated_points(path: str | os.PathLike[str]) -> np.ndarray | None:
-    """The image points at which a JSON of ours states its error: middle and corners, (m, 2).
+    """Middle and corners of the image, for which a JSON of ours states its error, (m, 2).
 
-    They are in px, or mm where the calibration has no pixels; None if the file holds none.
+    They are in px, or mm where the calibration has no pixels; None if the file holds none. Points
+    that a caller asked for are not among them: they may lie anywhere.
 
     Raises:
         FormatError: a ``.json`` that is no JSON object.
     """
     stated = _stated(path, "tre")
     try:
-        points = np.array([each["image"] for each in stated["points"]], dtype=np.float64)  # pyright: ignore[reportOptionalSubscript]
-    except (TypeError, KeyError, ValueError, OverflowError):
+        corners = [each for each in stated["points"] if each.get("name") != ASKED_FOR]
+        points = np.array([each["image"] for each in corners], dtype=np.float64)
+    except (AttributeError, TypeError, KeyError, ValueError, OverflowError):
         return None
     sound = points.ndim == 2 and points.shape[1] == 2 and np.isfinite(points).all()
     return points if sound else None
