@@ -207,8 +207,8 @@ def error_shares(
     part = np.einsum("pq,kpq->k", weight, found.shares)
     if not np.isfinite(part).all() or not part.sum() > 0:
         return np.full(len(KINDS), np.nan)
-    if answer.prior in ("none", "bounded"):
-        # These weigh all kinds alike: scale the shares by the kinds' own variances.
+    if answer.prior == "bounded":
+        # All kinds have one variance there: scale the shares by the kinds' own variances.
         part = part * np.asarray(answer.sigma, float) ** 2
     return part / part.sum()
 
