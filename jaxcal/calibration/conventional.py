@@ -27,6 +27,7 @@ from jaxcal.diagnostics.uncertainty import (
     threshold,
     variances_by_axis,
 )
+from jaxcal.model.thresholds import STATIONARY
 from jaxcal.model.unknowns import FURTHER, count_unknowns, split_further
 from jaxcal.result.calibration import Calibration, Linearisation, Medium, Status
 from jaxcal.runtime.arrays import map_arrays
@@ -34,9 +35,6 @@ from jaxcal.solvers.closed_form.reduced_objective import CONSTRAINTS
 from jaxcal.solvers.closed_form.single import ClosedForm, solve_problem
 from jaxcal.solvers.convergence import Convergence
 from jaxcal.solvers.plan import SolvePlan
-
-STATIONARY = 1e-6
-"""Largest gradient cosine of an answer through which derivatives are valid."""
 
 
 def closed_form_answer(problem: Problem, plan: SolvePlan) -> Calibration | None:

@@ -44,7 +44,7 @@ from jaxcal.model.unknowns import (
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import AnyArray, Float
 from jaxcal.runtime.arrays import array_module, is_traced
-from jaxcal.runtime.given_values import is_number, real_array
+from jaxcal.runtime.given_values import is_number, traceable_array
 from jaxcal.runtime.jax_modes import traceable
 from jaxcal.solvers.plan import TUNED
 
@@ -221,12 +221,9 @@ def predicted_tre(
 
 def _image_points(points: Any) -> Any:
     """Points [lateral, axial], checked as far as they have values."""
-    if is_traced(points):
-        points = array_module(points).asarray(points)
-    else:
-        points = real_array(points, "points")
-        if not np.isfinite(points).all():
-            raise InputError("points must be finite")
+    points = traceable_array(points, "points")
+    if not is_traced(points) and not np.isfinite(points).all():
+        raise InputError("points must be finite")
     if points.ndim == 0 or points.shape[-1] != 2:
         raise InputError(f"points must have shape (..., 2), not {points.shape}")
     return points
@@ -256,10 +253,6 @@ class TargetError:
     rms: Float[np.ndarray, "*shape"]
     lower: Float[np.ndarray, "*shape"]
     upper: Float[np.ndarray, "*shape"]
-
-    def times(self, factor: float) -> TargetError:
-        """All of it multiplied by a factor."""
-        return TargetError(factor * self.rms, factor * self.lower, factor * self.upper)
 
 
 def tre_at(calibration: Calibration, points: Float[np.ndarray, "*points 2"]) -> TargetError:

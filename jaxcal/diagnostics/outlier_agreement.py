@@ -66,7 +66,7 @@ def agreeing_outliers(
         own, problem, kept
     ):
         return None
-    stretch = _pixel_size(other, problem) / _pixel_size(own, problem)
+    stretch = pixel_size(other, problem) / pixel_size(own, problem)
     face = float(np.asarray(problem.face_offset))
     apart = distance(own.image_to_probe, other.image_to_probe, stretch, grid, face)
     if apart <= LEAST_APART * stated * math.sqrt(1 + kept.sum() / left.sum()):
@@ -81,7 +81,7 @@ def _sd_in_image(found: ClosedForm, problem: Problem, used: np.ndarray) -> float
     return math.sqrt(float(np.sum(off**2)) / freedom)
 
 
-def _pixel_size(found: ClosedForm, problem: Problem) -> Float[np.ndarray, " 2"]:
+def pixel_size(found: ClosedForm | Calibration, problem: Problem) -> Float[np.ndarray, " 2"]:
     """Lateral and axial size of a pixel, mm; ones for points in mm."""
     spacing = np.asarray(problem.spacing, float)
     return spacing if found.scale_mm_per_px is None else np.asarray(found.scale_mm_per_px)

@@ -160,6 +160,20 @@ class Spectra:
         return cls(values[:, -1] / smallest, weakest, sd)
 
 
+def rests_on_bound(
+    y: Float[AnyArray, "*batch n"], force: Float[AnyArray, "*batch n"], limit: AnyArray
+) -> Any:
+    """Whether each offset y rests on its bound, where the cost would fall beyond it (traceable).
+
+    Args:
+        y: mm.
+        force: half the derivative of the cost by y, mm.
+        limit: the bound, mm.
+    """
+    xp = array_module(y, force, limit)
+    return (xp.abs(y) >= (1 - AT_BOUND) * limit) & (xp.sign(y) * force <= 0)
+
+
 def rounding(used: Float[AnyArray, "*batch"], lever: Float[AnyArray, "*batch"]) -> Any:
     """A sum of squared residuals up to this, mm^2, is rounding: the data are exact."""
     return used * (64 * np.finfo(lever.dtype).eps * lever) ** 2
@@ -298,10 +312,8 @@ def _offsets(
         residual, axial = seen.from_circle(y)
         slope = y / axial
         limit = np.minimum(bound, LARGEST_ELEVATION * np.abs(seen.distance))
-        # Half the derivative of the cost by y; at an offset on its bound it points outwards.
         force = slope * residual[..., 2] - residual[..., 1]
-        near = np.abs(y) >= (1 - AT_BOUND) * limit
-        at_bound = (kept & near & (np.sign(y) * force <= 0)).astype(float)
+        at_bound = (kept & rests_on_bound(y, force, limit)).astype(float)
         rows = seen.circle_rows(axial)
         through = slope[..., None] * rows[..., 2, :] - rows[..., 1, :]
         weight = 1 + slope**2

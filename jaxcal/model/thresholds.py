@@ -16,3 +16,6 @@ MAD = 1.4826
 
 RELATIVE_FLOOR = 0.02
 """No component's SD is taken to be less than this share of the largest."""
+
+STATIONARY = 1e-6
+"""Largest gradient cosine of an answer through which derivatives are valid; 1e-3 in float32."""

@@ -329,9 +329,7 @@ class Calibration:
         Raises:
             CalibrationError: under jit, vmap or grad, where there is no text: use ``status_code``.
         """
-        names = np.array([status.name.lower() for status in Status])
-        chosen = names[self._concrete(self.status_code)]
-        return str(chosen) if chosen.ndim == 0 else chosen
+        return status_names(self._concrete(self.status_code))
 
     @cached_property
     def _summary(self) -> Summary:
@@ -632,6 +630,12 @@ class Calibration:
                 "use the arrays (status_code, converged, ...) there, and the rest outside"
             )
         return np.asarray(value)
+
+
+def status_names(status_code: Int[np.ndarray, "*batch"]) -> str | np.ndarray:
+    """The name of a :class:`Status`, or of each in an array."""
+    chosen = np.array([status.name.lower() for status in Status])[status_code]
+    return str(chosen) if chosen.ndim == 0 else chosen
 
 
 def check_one(status_code: Int[AnyArray, "*batch"]) -> None:

@@ -424,33 +424,32 @@ def transform_from_record(record: dict[str, Any], *, source: str = "memory") -> 
     usable = record.get("converged")
     if not (usable is None or isinstance(usable, bool)):
         raise FormatError("converged must be true, false or null")
-    scale = _array(record, "scale_mm_per_px", (2,))
-    offset = _array(record, "face_offset_mm", ())
-    factor = _array(record, "range_factor", ())
-    error = _array(record, "rms_mm", ())
-    tre = record.get("tre")
-    times = _array(tre, "factor", ()) if isinstance(tre, dict) else None
-    date, frames = record.get("date"), record.get("pose_frames")
-    named = frames.get("from") if isinstance(frames, dict) else None
+    tre, frames = (
+        found if isinstance(found, dict) else {}
+        for found in (record.get("tre"), record.get("pose_frames"))
+    )
+    date, named = record.get("date"), frames.get("from")
     if not (date is None or isinstance(date, str)):
         raise FormatError("date must be text")
-    usable = usable and not record.get("wrong_frames")
     unknowns = _unknowns(record)
     size = len(tangent_names(unknowns))
+    given = {
+        "scale_mm_per_px": _array(record, "scale_mm_per_px", (2,)),
+        "face_offset_mm": _array(record, "face_offset_mm", ()),
+        "range_factor": _array(record, "range_factor", ()),
+        "error_mm": _array(record, "rms_mm", ()),
+        "tre_factor": _array(tre, "factor", ()),
+        "covariance": _array(record, "covariance", (6, 6)),
+        "image_covariance": _array(record, "image_covariance", (size, size)),
+        "probe_frame": named if isinstance(named, str) else None,
+    }
     return ImageTransform(
         matrix,
-        scale,
-        0.0 if offset is None else float(offset),
-        _array(record, "covariance", (6, 6)),
-        None if error is None else float(error),
-        usable,
-        source,
-        1.0 if factor is None else float(factor),
-        unknowns,
-        _array(record, "image_covariance", (size, size)),
-        date,
-        named if isinstance(named, str) else "Probe",
-        1.0 if times is None else float(times),
+        converged=usable and not record.get("wrong_frames"),
+        source=source,
+        unknowns=unknowns,
+        date=date,
+        **{name: value for name, value in given.items() if value is not None},
     )
 
 
