@@ -426,7 +426,9 @@ def _one_problem(
 def _plain(*trees: Any) -> tuple[Any, ...]:
     """These in numpy's arrays, and numpy; as they are, and jax.numpy, if one is traced."""
     xp = array_module(*trees)
-    return (*(trees if xp is not np else (map_arrays(np.asarray, tree) for tree in trees)), xp)
+    if xp is np:
+        trees = tuple(map_arrays(np.asarray, tree) for tree in trees)
+    return (*trees, xp)
 
 
 def _used(problem: Problem, result: Calibration) -> tuple[Problem, Any]:
@@ -437,7 +439,7 @@ def _used(problem: Problem, result: Calibration) -> tuple[Problem, Any]:
 
 
 def _placed(tree: T, given: Problem) -> T:
-    """JAX's arrays where the problem's are, unless it is traced."""
+    """The tree in JAX's arrays on the problem's device; as it is while traced."""
     return tree if is_traced(tree) else as_jax_holds(tree, given)
 
 

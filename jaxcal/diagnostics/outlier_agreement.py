@@ -1,7 +1,8 @@
 """Do the images that were left out as outliers agree among themselves on another calibration?
 
-Then it is not said which of the two groups is right: a probe that was mounted anew, or a second
-echo. Each group is fitted conventionally, and the two fits are compared where they put the image.
+If they do (a probe that was mounted anew, a second echo), the data do not say which of the two
+groups is right. Each is fitted conventionally, and the two fits are compared by where they put the
+image.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ FEWEST_LEFT_OUT = 8
 """With fewer images left out there is no second group."""
 
 LEAST_SHARE = 0.2
-"""Nor is there if they are less than this share of the images in use."""
+"""Nor is there one if they are less than this share of the images in use."""
 
 LARGEST_SD_RATIO = 2.0
 """The images left out agree if the SD of their errors within the image, under a fit of their own,

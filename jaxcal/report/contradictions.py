@@ -226,7 +226,7 @@ def _from_limits(record: dict[str, Any]) -> list[tuple[float, str]]:
 
 
 def _scatter(scatter: float, stated: float) -> str:
-    """Of corners and middle of the part of the image in which targets were seen."""
+    """Words for a scatter at corners and middle of the part in which targets were seen, mm."""
     return (
         f"scatter by {scatter:.2f} mm where targets were seen, {scatter / stated:.1f} times as "
         f"much as the covariance states ({stated:.2f} mm)"

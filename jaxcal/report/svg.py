@@ -73,9 +73,9 @@ def viridis(share: Number) -> str:
 
 
 def ticks(low: Number, high: Number, most: int = 6) -> list[Any]:
-    """Round numbers between two others, at most ``most`` of them, or two more to have a second.
+    """Round numbers between two others, at most ``most`` of them.
 
-    A single number would tell no scale.
+    If that leaves a single one, which shows no scale, more are allowed.
     """
     if not high > low:
         return [low]

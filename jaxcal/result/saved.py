@@ -465,7 +465,8 @@ def _unknowns(record: dict[str, Any]) -> tuple[str, ...]:
     return blocks
 
 
-def _array(record: dict[str, Any], key: str, shape: tuple[int, ...]) -> np.ndarray | None:
+def _array(record: dict[str, Any], key: str, shape: tuple[int, ...]) -> Any:
+    """An array, a float for the shape (), or None."""
     value = record.get(key)
     if value is None:
         return None
@@ -476,7 +477,7 @@ def _array(record: dict[str, Any], key: str, shape: tuple[int, ...]) -> np.ndarr
     if array.shape != shape:
         raise FormatError(f"{key} must have shape {shape}, it has {array.shape}")
     if np.isfinite(array).all():
-        return array
+        return array if shape else float(array)
     # If the solve had failed, there may be NaN instead of null.
     if record.get("converged") is not False:
         raise FormatError(f"{key} holds NaN or Inf")
