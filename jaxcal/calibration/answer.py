@@ -48,12 +48,7 @@ from jaxcal.result.calibration import Calibration, Linearisation, Medium, Status
 from jaxcal.solvers.convergence import Convergence
 from jaxcal.solvers.dense import inverse_batch_last
 from jaxcal.solvers.methods import Solution
-from jaxcal.solvers.normal_equations import (
-    ComponentSums,
-    accumulate,
-    component_sums,
-    stacked,
-)
+from jaxcal.solvers.normal_equations import ComponentSums, accumulate, component_sums, stacked
 from jaxcal.solvers.plan import Given, SolvePlan
 
 LEAST_GAP_MM = 1e-6

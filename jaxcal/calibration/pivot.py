@@ -36,12 +36,7 @@ from jaxcal.runtime.arrays import first_images, is_traced
 from jaxcal.runtime.given_values import check_flag, real_array, truth_array
 from jaxcal.runtime.jax_modes import in_own_modes, inside_transformation, require_float64
 from jaxcal.solvers import dense
-from jaxcal.solvers.consensus import (
-    ConsensusModel,
-    find_consensus,
-    linearise,
-    studentised_errors,
-)
+from jaxcal.solvers.consensus import ConsensusModel, find_consensus, linearise, studentised_errors
 
 BLOCKS = ("translation", "point")
 AXES = ("x", "y", "z")

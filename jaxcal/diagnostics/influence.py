@@ -37,13 +37,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxcal.diagnostics.image_errors import (
-    KINDS,
-    ImageErrors,
-    Whitened,
-    further_prior,
-    quadratic,
-)
+from jaxcal.diagnostics.image_errors import KINDS, ImageErrors, Whitened, further_prior, quadratic
 from jaxcal.diagnostics.uncertainty import inverses, variances_by_axis
 from jaxcal.model.unknowns import predicted_distance
 from jaxcal.result.calibration import Calibration, check_one, data_of

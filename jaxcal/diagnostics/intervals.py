@@ -33,14 +33,7 @@ from scipy import special
 
 from jaxcal import InputError
 from jaxcal.model.image_points import mean_of_squares, point_jacobian
-from jaxcal.model.unknowns import (
-    TINY,
-    Values,
-    count_unknowns,
-    in_image,
-    measured,
-    split_further,
-)
+from jaxcal.model.unknowns import TINY, Values, count_unknowns, in_image, measured, split_further
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import AnyArray, Float
 from jaxcal.runtime.arrays import array_module, is_traced
@@ -86,12 +79,11 @@ def degrees_of_freedom(calibration: Calibration) -> Float[AnyArray, "*batch"]:
     """Degrees of freedom of the noise's SDs (traceable); inf where SDs were given."""
     _check(calibration)
     xp = array_module(calibration)
-    left = (
-        xp.sum(xp.asarray(calibration.mask) > 0, axis=-1) - count_unknowns(calibration.blocks) / 3
-    )
+    used = xp.sum(xp.asarray(calibration.mask) > 0, axis=-1)
+    left = xp.asarray(xp.maximum(used - count_unknowns(calibration.blocks) / 3, 1.0))
     if calibration.prior not in TUNED:
-        return xp.asarray(xp.maximum(left, 1.0))
-    return xp.where(calibration.sigma_tuned, xp.maximum(left, 1.0), np.inf)
+        return left
+    return xp.where(calibration.sigma_tuned, left, np.inf)
 
 
 def student_variance(left: Float[AnyArray, "*#b"]) -> Float[AnyArray, "*b"]:

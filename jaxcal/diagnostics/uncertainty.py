@@ -87,14 +87,9 @@ def assess(answer: Calibration, seen: ImageErrors, eps: float) -> Uncertainty:
     variance = np.asarray(linearisation.variance)
     scale = mm_at_target(seen.lever(kept), blocks)
     both = scale[:, :, None] * scale[:, None]
+    design = np.asarray(linearisation.design)
     whitened = answer.prior in TUNED
-    found = Spectra.of(
-        information / both,
-        np.asarray(linearisation.design) / both,
-        variance,
-        eps,
-        whitened=whitened,
-    )
+    found = Spectra.of(information / both, design / both, variance, eps, whitened=whitened)
     inverse = inverses(information, eps)
     size = np.where(np.isnan(found.weakest_sd), np.nan, variance)
     at_bound, elevation_sd = _offsets(answer, seen, inverse, size)
@@ -163,12 +158,9 @@ class Spectra:
 def rests_on_bound(
     y: Float[AnyArray, "*batch n"], force: Float[AnyArray, "*batch n"], limit: AnyArray
 ) -> Any:
-    """Whether each offset y rests on its bound, where the cost would fall beyond it (traceable).
+    """Whether each offset y (mm) rests on its bound (traceable).
 
-    Args:
-        y: mm.
-        force: half the derivative of the cost by y, mm.
-        limit: the bound, mm.
+    There the cost falls outwards; ``force`` is half its derivative by y, mm.
     """
     xp = array_module(y, force, limit)
     return (xp.abs(y) >= (1 - AT_BOUND) * limit) & (xp.sign(y) * force <= 0)

@@ -25,19 +25,8 @@ from jaxcal.design.candidates import seen_region
 from jaxcal.design.constraints import Region
 from jaxcal.diagnostics.gaussian_offsets import away_from_gaussian
 from jaxcal.diagnostics.image_errors import KINDS, ImageErrors, noise_covariance
-from jaxcal.diagnostics.influence import (
-    Influence,
-    conventional_fit,
-    excess,
-    in_image,
-    influence_of,
-)
-from jaxcal.diagnostics.intervals import (
-    image_jacobian,
-    predicted_tre,
-    tre_at,
-    tre_over,
-)
+from jaxcal.diagnostics.influence import Influence, conventional_fit, excess, in_image, influence_of
+from jaxcal.diagnostics.intervals import image_jacobian, predicted_tre, tre_at, tre_over
 from jaxcal.diagnostics.outlier_agreement import agreeing_outliers, pixel_size
 from jaxcal.diagnostics.unmodelled import unmodelled
 from jaxcal.model.image_points import distance, mean_of_squares

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from html import escape
 from typing import Any
 
@@ -150,25 +151,21 @@ def figure(height: Number, parts: Iterable[str], label: str) -> str:
     )
 
 
+@dataclass(frozen=True)
 class Panel:
     """A rectangle with two linear axes.
 
-    Args:
+    Attributes:
         box: left, top, right and bottom, in the figure's units.
         x: least and greatest value.
         y: the same; the greatest is on top unless ``down``.
         down: y grows downwards, as depth does.
     """
 
-    def __init__(
-        self,
-        box: tuple[Number, Number, Number, Number],
-        x: tuple[Number, Number],
-        y: tuple[Number, Number],
-        *,
-        down: bool = False,
-    ) -> None:
-        self.box, self.x, self.y, self.down = box, x, y, down
+    box: tuple[Number, Number, Number, Number]
+    x: tuple[Number, Number]
+    y: tuple[Number, Number]
+    down: bool = False
 
     def place(self, x: Number, y: Number) -> tuple[Any, Any]:
         """The position of a point in the figure."""
