@@ -285,26 +285,26 @@ def load_calibration(path: str | os.PathLike[str]) -> ImageTransform:
     with naming(path):
         if os.path.isfile(os.path.join(name, "calibration.json")):
             raise FormatError("is a folder: name the calibration.json in it")
-        if lower.endswith(".xml"):
+        if lower.endswith(_EXTENSIONS["plus"]):
             from jaxcal.io.plus import read_transform
 
             found = read_transform(path)
             _check_calibrated(found.matrix)
             made = transform_from_plus_matrix(found.matrix, error_mm=found.error_mm, source=name)
             return replace(made, probe_frame=found.target)
-        if lower.endswith((".tfm", ".txt", ".h5")):
+        if lower.endswith(_EXTENSIONS["itk"]):
             from jaxcal.io.itk import read_itk
 
             matrix = read_itk(path)
             _check_calibrated(matrix)
             return transform_from_plus_matrix(matrix, source=name)
-        if lower.endswith(".csv"):
+        if lower.endswith(_EXTENSIONS["tusrec"]):
             from jaxcal.io.tus_rec import read_calib_matrix
 
             rigid, scale = read_calib_matrix(path)
             matrix = rigid @ np.diag([*scale, scale.mean(), 1.0])
             return transform_from_plus_matrix(matrix, source=name)
-        if lower.endswith((".yaml", ".yml")):
+        if lower.endswith(_EXTENSIONS["ros"]):
             from jaxcal.io.ros import read_ros_yaml
 
             matrix, held = read_ros_yaml(path)
