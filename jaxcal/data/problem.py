@@ -127,7 +127,7 @@ class Problem:
         """Number and unit of the images, and what is known of them; not the arrays."""
         if not has_values(self.mask, self.spacing):
             return outline(self)
-        count = f"{int((self.mask > 0).sum())} used of {self.images} images"
+        count = f"{np.count_nonzero(np.asarray(self.mask) > 0)} used of {self.images} images"
         unit = "pixels" if self.pixels else "points in mm"
         if self.batch_shape:
             count = f"batch of {' x '.join(map(str, self.batch_shape))}, {self.images} images each"

@@ -585,7 +585,7 @@ class Calibration:
         how = self.method if self.prior == "none" else f"{self.method}, prior {self.prior}"
         if np.ndim(self.mask) != 1:
             return f"Calibration({how}, {batch_in_words(self)})"
-        count = f"{int(self.images_used)} used of {len(self.mask)} images"
+        count = f"{np.count_nonzero(np.asarray(self.mask) > 0)} used of {len(self.mask)} images"
         return f"Calibration({how}, {self.status}, {count}, RMS {float(self.rms):.3g} mm)"
 
     def __str__(self) -> str:
