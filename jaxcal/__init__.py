@@ -12,7 +12,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING
 
-# They must see every fork, and every import of JAX.
+# Imported first, since they watch for forks and for the import of JAX.
 from jaxcal.runtime import forks as _forks  # noqa: F401
 from jaxcal.runtime import when_jax as _when_jax  # noqa: F401
 

@@ -19,6 +19,7 @@ from jaxcal import design
 from jaxcal.calibration.resampling import relative_twist
 from jaxcal.cli import plan
 from jaxcal.cli.main import main
+from jaxcal.data.poses import targets_in_images
 from jaxcal.data.recording import Recording, make_images
 from jaxcal.diagnostics import influence as influences
 from jaxcal.diagnostics.influence import excess, in_image, influence_of
@@ -434,6 +435,33 @@ def test_record_and_table_begin_with_the_error_at_the_image(record, result):
     assert text.index("error to expect at the image") < text.index("method")
     assert f"{tre['rms_mm']:.2f} mm" in headline(record)
     assert sum(record["limits"]["error_share"].values()) == pytest.approx(1)
+
+
+def test_shares_of_a_conventional_fit_are_those_of_its_own_response():
+    """Each error of each image is made in turn, in exact data, and the fit is repeated."""
+    recording = jaxcal.simulate_recording(jaxcal.Protocol(images=24, test_images=0), 3)
+    result = jaxcal.calibrate(recording, "conventional")
+    told = record_of(result)["limits"]["error_share"]
+    x, target = (np.asarray(each) for each in (result.image_to_probe, result.point))
+    images = recording.calibration
+    axes = images.poses[:, :3, :3] @ x[:3, 1]
+    q = targets_in_images(images.poses, x, target)
+    corners = np.array([[-20.0, 0, 10, 1], [20, 0, 10, 1], [-20, 0, 80, 1], [20, 0, 80, 1]])
+
+    def fitted(image: int | None = None, kind: int = 0) -> np.ndarray:
+        off = np.zeros((len(q), 3))
+        if image is not None:
+            off[image, kind] = 1e-3
+        poses = images.poses.copy()
+        poses[:, :3, 3] += axes * (q[:, 1] - off[:, 2])[:, None]
+        exact = make_images(poses, q[:, [0, 2]] + off[:, :2], "point")
+        return corners @ calibrate_closed_form(exact).image_to_probe[:3].T
+
+    whole = fitted()
+    moved = np.array([[fitted(i, k) - whole for i in range(len(q))] for k in range(3)])
+    shares = np.asarray(result.sigma) ** 2 * np.sum(moved**2, axis=(1, 2, 3))
+    np.testing.assert_allclose(list(told.values()), shares / shares.sum(), atol=0.05)
+    assert told["lateral"] > 0.1
 
 
 def test_rms_in_the_plane_is_in_the_plane(record, result):

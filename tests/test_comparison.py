@@ -182,6 +182,8 @@ def test_points_are_those_of_the_first_record_that_states_its_error(files, capsy
     assert main(["compare", files[0]]) == 2
     record = json.loads(Path(files[1]).read_text())
     stated = [{"name": "middle", "image": point} for point in POINTS.tolist()]
+    # A point that "calibrate --tre" was asked for may lie far outside the image.
+    stated.append({"name": "asked for", "image": [9e3, 9e3]})
     Path(files[1]).write_text(json.dumps(record | {"tre": {"points": stated}}))
     assert main(["compare", *files[:2], "--json"]) == 0
     (pair,) = json.loads(capsys.readouterr().out)["pairs"]

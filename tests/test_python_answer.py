@@ -85,6 +85,36 @@ def test_batches_and_traces_print_without_a_verdict(recording):
     assert shapes._repr_html_() is None
 
 
+def test_debuggers_and_lists_of_a_notebook_show_no_arrays(recording):
+    """``repr`` says what a problem or a calibration is; its fields where it has no values."""
+    pixels = jaxcal.make_images(
+        np.tile(np.eye(4), (5, 1, 1)), np.ones((5, 2)), "pixel", spacing_mm=(0.1, 0.2)
+    )
+    problem = jaxcal.Problem.from_recording(recording)
+    result = jaxcal.calibrate(problem, "conventional")
+    batch = jaxcal.calibrate_batch([problem, problem], "conventional")
+    assert repr(jaxcal.Problem.from_recording(pixels)) == (
+        "Problem(5 used of 5 images, pixels of 0.1 x 0.2 mm)"
+    )
+    n = problem.images
+    known = "points in mm, with sound_speed, delay"
+    assert repr(problem) == f"Problem({n} used of {n} images, {known})"
+    assert repr(batch.problem).startswith(f"Problem(batch of 2, {n} images each, points in mm")
+    assert repr(result) == (
+        f"Calibration(conventional, converged, {n} used of {n} images, "
+        f"RMS {float(result.rms):.3g} mm)"
+    )
+    assert repr(batch) == "Calibration(conventional, batch of 2: 2 converged)"
+    assert str(replace(result, problem=None)) == repr(result)
+    assert "information=float64[9,9], design=float64[9,9]" in repr(result.linearisation)
+    shapes = jax.eval_shape(lambda each: each, (problem, result))
+    traced = []
+    jax.jit(lambda each: traced.append(repr(each)))(problem)
+    for said in (*map(repr, shapes), *traced):
+        assert f"mask=float64[{n}]" in said
+        assert len(said) < 2500
+
+
 def test_intervals_are_refused_in_words_where_they_are_traced(result):
     with pytest.raises(jaxcal.CalibrationError, match="not available under jit"):
         jax.jit(jaxcal.transform_intervals)(result)

@@ -27,10 +27,10 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxcal.data.problem import Problem
 from jaxcal.data.recording import MINIMUM_IMAGES
 from jaxcal.diagnostics.uncertainty import (
-    AT_BOUND,
     LARGEST_SD,
     covariance_by_axis,
     mm_at_target,
+    rests_on_bound,
     threshold,
     variances_by_axis,
 )
@@ -42,18 +42,13 @@ from jaxcal.model.observations import (
     LocalUnknown,
     local_unknowns,
 )
-from jaxcal.model.thresholds import LARGEST_ELEVATION, MINIMUM_SELF_TUNING
+from jaxcal.model.thresholds import LARGEST_ELEVATION, MINIMUM_SELF_TUNING, STATIONARY
 from jaxcal.model.unknowns import Blocks, count_unknowns, split_further
 from jaxcal.result.calibration import Calibration, Linearisation, Medium, Status
 from jaxcal.solvers.convergence import Convergence
 from jaxcal.solvers.dense import inverse_batch_last
 from jaxcal.solvers.methods import Solution
-from jaxcal.solvers.normal_equations import (
-    ComponentSums,
-    accumulate,
-    component_sums,
-    stacked,
-)
+from jaxcal.solvers.normal_equations import ComponentSums, accumulate, component_sums, stacked
 from jaxcal.solvers.plan import Given, SolvePlan
 
 LEAST_GAP_MM = 1e-6
@@ -67,7 +62,7 @@ root mean square residuals."""
 def assemble(
     found: Solution, problem: Problem, images: ImagePlanes, given: Given, plan: SolvePlan
 ) -> Calibration:
-    """A calibration without its problem, which the caller adds with ``with_problem``.
+    """A calibration without its problem, which the caller adds.
 
     Args:
         found: where the method stopped. If the answer is to be differentiated, its arrays are
@@ -263,10 +258,8 @@ class ActiveBounds(eqx.Module):
         elevational = errors.q[1] - y
         cost = errors.squares(elevational, axial)
         limit = jnp.minimum(bound, LARGEST_ELEVATION * jnp.abs(distance))
-        # The derivative of half the cost by y; at an offset on its bound it points outwards.
         force = slope * (errors.q[2] - axial) - elevational
-        near = jnp.abs(y) >= (1 - AT_BOUND) * limit
-        resting = mask * near * (jnp.sign(y) * force <= 0)
+        resting = mask * rests_on_bound(y, force, limit)
         size = jnp.sqrt(1 + slope**2)
         typical = jnp.sqrt(cost / (3 * jnp.sum(mask, axis=-1)))
         typical = typical + jnp.finfo(typical.dtype).tiny
@@ -364,7 +357,7 @@ def _is_differentiable(
     plan: SolvePlan,
 ) -> Bool[Array, "*batch"]:
     """Whether the implicit function theorem's conditions hold at the solution."""
-    still = 1e-6 if float(jnp.finfo(convergence.cost.dtype).eps) < 1e-10 else 1e-3
+    still = STATIONARY if float(jnp.finfo(convergence.cost.dtype).eps) < 1e-10 else 1e-3
     good = (status == Status.CONVERGED) & (convergence.stationarity <= still)
     good = good & jnp.logical_not(jnp.any(convergence.sigma_floored, axis=-1))
     if bounds is not None:

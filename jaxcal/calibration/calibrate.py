@@ -21,7 +21,6 @@ from jaxcal.calibration.dependence import independent
 from jaxcal.calibration.serial_correlation import widened
 from jaxcal.data.problem import Problem, as_batch, as_problem, check_shapes, check_values
 from jaxcal.data.recording import MINIMUM_IMAGES, Images, Recording
-from jaxcal.model.distributions import Shape
 from jaxcal.model.unknowns import (
     DELAY_SD_S,
     FURTHER,
@@ -196,8 +195,7 @@ def _calibrated(problem: Problem, request: Request) -> Calibration:
     if is_traced(problem, given):
         return replace(_solve_alone(problem, given, plan), problem=problem)
     joined, found = independent(problem, request.estimate)
-    left = int(np.count_nonzero(np.asarray(joined.mask) > 0))
-    if left < MINIMUM_IMAGES:
+    if found.images < MINIMUM_IMAGES:
         raise InputError(
             f"{'; '.join(found.words) or 'too few images'}; at least {MINIMUM_IMAGES} that are "
             "independent are needed: hold the probe still at different poses"
@@ -370,9 +368,7 @@ def prepare(
         names = "element distance, offset" if channels else "lateral, range, elevational"
         raise InputError(f"sigma must be {components} numbers: {names}, mm")
     tuning = kind == "gaussian" and request.sigma is None
-    laws: tuple[Shape, ...] = ()
-    if tuning and request.prior in LAWS:
-        laws = LAWS[request.prior]
+    laws = LAWS.get(request.prior, ()) if tuning else ()
     plan = SolvePlan(
         request.method,
         kind,

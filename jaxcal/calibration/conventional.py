@@ -27,6 +27,7 @@ from jaxcal.diagnostics.uncertainty import (
     threshold,
     variances_by_axis,
 )
+from jaxcal.model.thresholds import STATIONARY
 from jaxcal.model.unknowns import FURTHER, count_unknowns, split_further
 from jaxcal.result.calibration import Calibration, Linearisation, Medium, Status
 from jaxcal.runtime.arrays import map_arrays
@@ -34,9 +35,6 @@ from jaxcal.solvers.closed_form.reduced_objective import CONSTRAINTS
 from jaxcal.solvers.closed_form.single import ClosedForm, solve_problem
 from jaxcal.solvers.convergence import Convergence
 from jaxcal.solvers.plan import SolvePlan
-
-STATIONARY = 1e-6
-"""Largest gradient cosine of an answer through which derivatives are valid."""
 
 
 def closed_form_answer(problem: Problem, plan: SolvePlan) -> Calibration | None:
@@ -70,32 +68,32 @@ def _with_uncertainty(found: ClosedForm, problem: Problem, plan: SolvePlan) -> C
     each = seen.circle_rows(axial)[0]
     rows, errors = each.reshape(-1, count_unknowns(blocks)), residual.ravel()
     design = rows.T @ rows
-    used, lever = np.asarray(seen.mask.sum()), seen.lever(seen.mask)
+    used, lever = np.asarray(seen.mask.sum()), np.asarray(seen.lever(seen.mask)[0])
     objective = float(errors @ errors)
     variance = objective / max(3 * used - count_unknowns(blocks), 1.0)
 
     # As in jaxcal.calibration.answer: which directions are known, in mm at the target.
-    scale = np.outer(*[mm_at_target(lever, blocks)[0]] * 2)
-    values = np.linalg.eigvalsh(design / scale)
+    scale = mm_at_target(lever, blocks)
+    values = np.linalg.eigvalsh(design / np.outer(scale, scale))
     if values[0] <= threshold(eps) * values.sum():
         return None
-    least = variance / (LARGEST_SD * lever[0]) ** 2
+    least = variance / (LARGEST_SD * lever) ** 2
     weak = values[0] <= least and eps * values.sum() < least
     status = Status.UNOBSERVABLE if weak else Status.CONVERGED
     covariance, information = np.full_like(design, np.nan), design
     if not weak:
         parts, squares = np.einsum("mkp,mkq->kpq", each, each), np.sum(residual[0] ** 2, axis=0)
         inverse = inverses(design[None], eps)[0]
-        variances = variances_by_axis(parts, squares, used, inverse, np.asarray(lever[0]))
+        variances = variances_by_axis(parts, squares, used, inverse, lever)
         relative = covariance_by_axis(parts, variances, inverse)
         covariance, information = variance * relative, inverses(relative[None], eps)[0]
 
-    parts = [seen.unknowns.further[name] for name in FURTHER if name in blocks]
-    further = np.array([part[0] for block in parts for part in block])
+    values = [seen.unknowns.further[name] for name in FURTHER if name in blocks]
+    further = np.array([component[0] for value in values for component in value])
     gradient = np.abs(errors @ rows)
     length = np.sqrt(np.diag(design) * objective)
     # With exact data the errors are only rounding, and their gradient means nothing.
-    exact = objective <= rounding(used, np.asarray(lever[0]))
+    exact = objective <= rounding(used, lever)
     cosine = 0.0 if exact else float(np.max(gradient / np.maximum(length, 1e-300)))
     trace = None
     if plan.options.trace:

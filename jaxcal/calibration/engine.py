@@ -49,7 +49,7 @@ FEW_PROBLEMS = 1024
 @in_own_modes
 def solve_problem(problem: Problem, given: Given, plan: SolvePlan) -> Calibration:
     """Solve one problem; the result does not hold the problem (traceable)."""
-    executables.refuse_after_fork()  # what JAX compiles waits without end as well
+    executables.refuse_after_fork()  # a program that JAX compiles would hang there, too
     if _is_kept(problem, plan, inside=inside_transformation(problem, given)):
         return _solve_kept(problem, given, plan)
     return _solve_compiled(problem, given, plan)
@@ -114,7 +114,7 @@ def solve_batch(problems: Problem, given: Given, plan: SolvePlan, chunk: int | N
     else:
         result = _solve_chunks_compiled(flat, given, plan, largest)
     result = map_arrays(lambda leaf: leaf[:count].reshape((*shape, *leaf.shape[1:])), result)
-    # Only now: a slice of a numpy array is a view, one of a JAX array is a program that copies.
+    # Moved after it is cut: a slice of a numpy array is a view, one of a JAX array a copy.
     return replace(as_jax_holds(result, problems) if kept else result, problem=problems)
 
 

@@ -30,18 +30,13 @@ from jaxcal.model.outlying import stands_out
 from jaxcal.model.parameters import Parameters, retract
 from jaxcal.model.residuals import target_in_image
 from jaxcal.model.thresholds import FEWEST_IMAGES
-from jaxcal.result.calibration import Status, check_one
+from jaxcal.result.calibration import Status, check_one, status_names
 from jaxcal.runtime import compiler, executables
 from jaxcal.runtime.arrays import first_images, is_traced
 from jaxcal.runtime.given_values import check_flag, real_array, truth_array
 from jaxcal.runtime.jax_modes import in_own_modes, inside_transformation, require_float64
 from jaxcal.solvers import dense
-from jaxcal.solvers.consensus import (
-    ConsensusModel,
-    find_consensus,
-    linearise,
-    studentised_errors,
-)
+from jaxcal.solvers.consensus import ConsensusModel, find_consensus, linearise, studentised_errors
 
 BLOCKS = ("translation", "point")
 AXES = ("x", "y", "z")
@@ -93,8 +88,7 @@ class Pivot(eqx.Module):
     @property
     def status(self) -> str | np.ndarray:
         """converged, max_iterations, unobservable or failed; an array of these for a batch."""
-        chosen = np.array([status.name.lower() for status in Status])[np.asarray(self.status_code)]
-        return str(chosen) if chosen.ndim == 0 else chosen
+        return status_names(np.asarray(self.status_code))
 
     @property
     def weakest(self) -> Float[np.ndarray, "*batch 3"]:

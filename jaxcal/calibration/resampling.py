@@ -23,12 +23,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from jaxcal import InputError
-from jaxcal.calibration.calibrate import (
-    Request,
-    calibrate,
-    calibrate_batch,
-    prepare,
-)
+from jaxcal.calibration.calibrate import Request, calibrate, calibrate_batch, prepare
 from jaxcal.calibration.dependence import independent
 from jaxcal.calibration.engine import as_jax_holds
 from jaxcal.data.problem import Problem, as_problem
@@ -37,7 +32,7 @@ from jaxcal.diagnostics.image_errors import noise_covariance
 from jaxcal.diagnostics.intervals import range_of_row_zero
 from jaxcal.diagnostics.metrics import calibration_reproducibility, reconstruct
 from jaxcal.model.thresholds import MAD
-from jaxcal.model.unknowns import Values, measured, split_further, unknown_names
+from jaxcal.model.unknowns import measured, split_further, unknown_names
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime import executables
 from jaxcal.runtime.array_types import AnyArray
@@ -431,7 +426,9 @@ def _one_problem(
 def _plain(*trees: Any) -> tuple[Any, ...]:
     """These in numpy's arrays, and numpy; as they are, and jax.numpy, if one is traced."""
     xp = array_module(*trees)
-    return (*(trees if xp is not np else (map_arrays(np.asarray, tree) for tree in trees)), xp)
+    if xp is np:
+        trees = tuple(map_arrays(np.asarray, tree) for tree in trees)
+    return (*trees, xp)
 
 
 def _used(problem: Problem, result: Calibration) -> tuple[Problem, Any]:
@@ -442,7 +439,7 @@ def _used(problem: Problem, result: Calibration) -> tuple[Problem, Any]:
 
 
 def _placed(tree: T, given: Problem) -> T:
-    """JAX's arrays where the problem's are, unless it is traced."""
+    """The tree in JAX's arrays on the problem's device; as it is while traced."""
     return tree if is_traced(tree) else as_jax_holds(tree, given)
 
 
@@ -465,15 +462,10 @@ def _with_rows(problem: Problem, rows: AnyArray, mask: Float[AnyArray, "k n"]) -
     return replace(each_image(many, lambda values, axis: values[each, rows]), mask=mask)
 
 
-def _unknowns(result: Calibration) -> tuple[Any, Any, Any, Values]:
-    """Rotation and translation of X, the target, and the free further unknowns by name."""
-    x, values = result.image_to_probe, split_further(result.linearisation.further, result.blocks)
-    return x[..., :3, :3], x[..., :3, 3], result.point, values
-
-
-def _points(problem: Problem, values: Values) -> tuple[AnyArray, AnyArray]:
-    """Lateral position and range of every image, mm."""
+def _points(problem: Problem, result: Calibration) -> tuple[AnyArray, AnyArray]:
+    """Lateral position and range of every image by its calibration, or by one for all, mm."""
     scaled = problem.measurements * problem.spacing
+    values = split_further(result.linearisation.further, result.blocks)
     return measured(scaled[:, 0], scaled[:, 1], problem.face_offset, values)
 
 
@@ -482,18 +474,18 @@ def _held_out_errors(
 ) -> tuple[Float[AnyArray, "n 3"], Float[AnyArray, "n 3"]]:
     """Errors and reconstructed target of image i through calibration i, mm."""
     xp = array_module(held, problem)
-    rotation, translation, target, values = _unknowns(held)
-    lateral, distance = _points(problem, values)
+    x, target = held.image_to_probe, held.point
+    lateral, distance = _points(problem, held)
     turned, origin = problem.poses[:, :3, :3], problem.poses[:, :3, 3]
 
     def back(rotations: Any, vectors: Any) -> Any:
         return xp.einsum("nji,nj->ni", rotations, vectors)
 
-    q = back(rotation, back(turned, target - origin) - translation)
+    q = back(x[:, :3, :3], back(turned, target - origin) - x[:, :3, 3])
     far = xp.hypot(q[:, 1], q[:, 2])
     errors = xp.stack([q[:, 0] - lateral, far - distance, q[:, 1]], axis=1)
     in_plane = xp.stack([lateral, distance], axis=1)
-    there = reconstruct(held.image_to_probe, problem.poses, in_plane)
+    there = reconstruct(x, problem.poses, in_plane)
     return problem.mask[:, None] * errors, problem.mask[:, None] * (there - target)
 
 
@@ -535,7 +527,7 @@ def _length_in_sds(
 def _box_points(problem: Problem, result: Calibration) -> Float[AnyArray, "5 2"]:
     """Corners and middle of the box that the used points fill, [lateral, axial], mm."""
     xp = array_module(problem, result)
-    points = xp.stack(_points(problem, _unknowns(result)[3]), axis=1)
+    points = xp.stack(_points(problem, result), axis=1)
     seen = problem.mask[:, None] > 0
     low = xp.min(xp.where(seen, points, xp.inf), axis=0)
     high = xp.max(xp.where(seen, points, -xp.inf), axis=0)

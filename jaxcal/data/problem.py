@@ -33,9 +33,11 @@ from jaxcal.runtime.arrays import (
     array_module,
     array_tree,
     each_image,
+    has_values,
     is_traced,
     jax_in_use,
     map_arrays,
+    outline,
     static,
 )
 from jaxcal.runtime.given_values import refuse_masked
@@ -120,6 +122,20 @@ class Problem:
 
     def __post_init__(self) -> None:
         _make_floating(self)
+
+    def __repr__(self) -> str:
+        """Number and unit of the images, and what is known of them; not the arrays."""
+        if not has_values(self.mask, self.spacing):
+            return outline(self)
+        count = f"{np.count_nonzero(np.asarray(self.mask) > 0)} used of {self.images} images"
+        unit = "pixels" if self.pixels else "points in mm"
+        if self.batch_shape:
+            count = f"batch of {' x '.join(map(str, self.batch_shape))}, {self.images} images each"
+        elif self.pixels and self.spacing_known:
+            unit = "pixels of {:.4g} x {:.4g} mm".format(*self.spacing.tolist())
+        optional = ("covariance", "max_elevation", "sound_speed", "delay", "channels")
+        known = ", ".join(name for name in optional if getattr(self, name) is not None)
+        return f"Problem({count}, {unit}{known and f', with {known}'})"
 
     @property
     def images(self) -> int:

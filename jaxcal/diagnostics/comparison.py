@@ -38,7 +38,7 @@ class Comparison:
         expected_mm: (m,) its root mean square by both covariances, mm; NaN where one is not known.
         rms_mm: root mean square of ``apart_mm``, mm.
         expected_rms_mm: the same of ``expected_mm``, mm.
-        limit_mm: ``rms_mm`` of 95 % of such pairs is less than this by both covariances, mm.
+        limit_mm: by both covariances, 95 % of such pairs have a smaller ``rms_mm``, mm.
         rotation_deg: angle between the two orientations of the image, degrees.
     """
 

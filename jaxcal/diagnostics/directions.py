@@ -20,9 +20,8 @@ def direction_in_words(vector: AnyArray, blocks: tuple[str, ...]) -> str:
         vector: components in scaled units (mm at the lever arm), in the order of ``blocks``.
         blocks: the unknowns.
     """
-    parts = {}
-    for block in blocks:
-        parts[block] = np.asarray(vector[block_slice(blocks, block)], dtype=float)
+    vector = np.asarray(vector, float)
+    parts = {block: vector[block_slice(blocks, block)] for block in blocks}
     size = {block: float(np.linalg.norm(part)) for block, part in parts.items()}
     total = float(np.linalg.norm(vector))
     if not np.isfinite(total) or total == 0:

@@ -1,10 +1,10 @@
 """The fit with Gaussian offsets and tuned SDs, beside answers whose offsets have sharp limits.
 
-Offsets that are free within a bound hide errors: those that the model leaves out, and that of the
-bound itself. If it is larger than the offsets, all answers in an interval fit equally well; if
-offsets exceed it, they move the answer. So do offsets without sharp limits under a uniform
-distribution. If the limits are right, the fit with Gaussian offsets is also right, only less
-precise, and the answer is from it by no more than its own error (Hausman 1978).
+Offsets that are free within a bound absorb errors that the model leaves out, and hide a wrong
+bound. If the bound is larger than the offsets, all answers in an interval fit equally well; if
+offsets exceed it, the answer is biased. It is also biased if offsets without sharp limits are taken
+to be uniform. If the limits are right, the fit with Gaussian offsets is right as well, only less
+precise, and the answer differs from it by no more than the error of that fit (Hausman 1978).
 """
 
 from __future__ import annotations

@@ -263,6 +263,7 @@ class Whitened:
         offset_precision: D of that unknown; 1 if there is none.
         offset_response: E / D, by which that unknown follows the shared ones; zeros if there is
             none.
+        log_sd: sum of the logarithms of an image's SDs, mm.
     """
 
     errors: Float[Array, "k n 3"]
@@ -270,6 +271,7 @@ class Whitened:
     offset_rows: Float[Array, "k n 3"] | None
     offset_precision: Float[Array, "k n"]
     offset_response: Float[Array, "k n p"]
+    log_sd: Float[Array, "k n"]
 
     @classmethod
     def of(cls, answer: Calibration, seen: ImageErrors) -> Whitened:
@@ -291,7 +293,10 @@ class Whitened:
             offset = parts[2][..., 0]
             weight = np.sum(offset**2, axis=-1) + 1
             response = np.einsum("knm,knmp->knp", offset, rows) / weight[..., None]
-        return cls(errors, rows, offset, weight, response)
+        log_sd = np.zeros(seen.mask.shape) + np.sum(np.log(sigma), axis=-1, keepdims=True)
+        if shape is not None:
+            log_sd = log_sd + 0.5 * np.log(np.linalg.det(shape))
+        return cls(errors, rows, offset, weight, response, log_sd)
 
     def leverage(self, inverse: Float[Array, "k p p"]) -> Float[Array, "k n 3"]:
         """The share of each error's variance that the fit absorbs."""

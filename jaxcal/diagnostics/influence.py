@@ -37,14 +37,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxcal.diagnostics.image_errors import (
-    KINDS,
-    ImageErrors,
-    Whitened,
-    further_prior,
-    own_covariance,
-    quadratic,
-)
+from jaxcal.diagnostics.image_errors import KINDS, ImageErrors, Whitened, further_prior, quadratic
 from jaxcal.diagnostics.uncertainty import inverses, variances_by_axis
 from jaxcal.model.unknowns import predicted_distance
 from jaxcal.result.calibration import Calibration, check_one, data_of
@@ -215,28 +208,22 @@ def whitened_errors(answer: Calibration) -> WhitenedErrors:
     if answer.prior in TUNED:
         return _from_points(answer, seen, used)
     sd = float(np.sqrt(answer.linearisation.variance[0]))
-    y = np.asarray(answer.elevation) if answer.prior == "bounded" else np.zeros_like(seen.mask)
-    free = used & (answer.at_bound[0] == 0) if answer.prior == "bounded" else None
-    found = _equal_weights(seen, y, sd, used, free)
     if answer.prior == "bounded":
-        return found
+        free = used & (answer.at_bound[0] == 0)
+        return _equal_weights(seen, np.asarray(answer.elevation), sd, used, free)
+    found = _equal_weights(seen, np.zeros_like(seen.mask), sd, used)
     parts = np.einsum("mkp,mkq->kpq", found.rows, found.rows)
     inverse = inverses(parts.sum(axis=0)[None], np.finfo(float).eps)[0]
     squares, count = np.sum(found.errors**2, axis=0), np.asarray(float(len(found.rows)))
-    lever = seen.lever(np.asarray(answer.mask))[0] / sd
-    return replace(
-        found, variances=variances_by_axis(parts, squares, count, inverse, np.asarray(lever))
-    )
+    lever = np.asarray(seen.lever(np.asarray(answer.mask))[0] / sd)
+    return replace(found, variances=variances_by_axis(parts, squares, count, inverse, lever))
 
 
 def _from_points(answer: Calibration, seen: ImageErrors, used: Array) -> WhitenedErrors:
-    tau = answer.linearisation.tracker_sd
-    seen = seen.shifted(answer).centred(answer)
-    whitened = Whitened.of(answer, seen)
-    errors, rows = whitened.errors[0][used], whitened.rows[0][used]
-    log_sd, shape = np.zeros(len(rows)), own_covariance(answer, seen.problem)
-    if shape is not None:
-        log_sd = 0.5 * np.log(np.linalg.det(shape[0][used]))
+    whitened = Whitened.of(answer, seen.shifted(answer).centred(answer))
+    errors, rows, log_sd = (
+        each[0][used] for each in (whitened.errors, whitened.rows, whitened.log_sd)
+    )
     if whitened.offset_rows is not None:
         # The image's own unknown has the prior variance 1, so errors have the covariance I + o o'.
         own = whitened.offset_rows[0][used]
@@ -247,10 +234,6 @@ def _from_points(answer: Calibration, seen: ImageErrors, used: Array) -> Whitene
         rows = rows + (shrink * unit)[..., None] * np.einsum("mk,mkp->mp", unit, rows)[:, None]
         # The estimate of that unknown has multiplied the errors by (I + o o')^-1.
         errors = errors + (1 / (1 + shrink) - 1) * unit * np.sum(unit * errors, axis=1)[:, None]
-    sigma = np.asarray(answer.sigma)[0]
-    if tau is not None:
-        sigma = np.hypot(sigma, float(tau[0]) * np.array([1.0, 1.0, 0.0]))
-    log_sd = log_sd + np.sum(np.log(sigma))
     return WhitenedErrors(errors, rows, np.arange(3), log_sd, used, np.ones(3))
 
 

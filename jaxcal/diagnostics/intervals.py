@@ -33,18 +33,11 @@ from scipy import special
 
 from jaxcal import InputError
 from jaxcal.model.image_points import mean_of_squares, point_jacobian
-from jaxcal.model.unknowns import (
-    TINY,
-    Values,
-    count_unknowns,
-    in_image,
-    measured,
-    split_further,
-)
+from jaxcal.model.unknowns import TINY, Values, count_unknowns, in_image, measured, split_further
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import AnyArray, Float
 from jaxcal.runtime.arrays import array_module, is_traced
-from jaxcal.runtime.given_values import is_number, real_array
+from jaxcal.runtime.given_values import is_number, traceable_array
 from jaxcal.runtime.jax_modes import traceable
 from jaxcal.solvers.plan import TUNED
 
@@ -86,12 +79,11 @@ def degrees_of_freedom(calibration: Calibration) -> Float[AnyArray, "*batch"]:
     """Degrees of freedom of the noise's SDs (traceable); inf where SDs were given."""
     _check(calibration)
     xp = array_module(calibration)
-    left = (
-        xp.sum(xp.asarray(calibration.mask) > 0, axis=-1) - count_unknowns(calibration.blocks) / 3
-    )
+    used = xp.sum(xp.asarray(calibration.mask) > 0, axis=-1)
+    left = xp.asarray(xp.maximum(used - count_unknowns(calibration.blocks) / 3, 1.0))
     if calibration.prior not in TUNED:
-        return xp.asarray(xp.maximum(left, 1.0))
-    return xp.where(calibration.sigma_tuned, xp.maximum(left, 1.0), np.inf)
+        return left
+    return xp.where(calibration.sigma_tuned, left, np.inf)
 
 
 def student_variance(left: Float[AnyArray, "*#b"]) -> Float[AnyArray, "*b"]:
@@ -221,12 +213,9 @@ def predicted_tre(
 
 def _image_points(points: Any) -> Any:
     """Points [lateral, axial], checked as far as they have values."""
-    if is_traced(points):
-        points = array_module(points).asarray(points)
-    else:
-        points = real_array(points, "points")
-        if not np.isfinite(points).all():
-            raise InputError("points must be finite")
+    points = traceable_array(points, "points")
+    if not is_traced(points) and not np.isfinite(points).all():
+        raise InputError("points must be finite")
     if points.ndim == 0 or points.shape[-1] != 2:
         raise InputError(f"points must have shape (..., 2), not {points.shape}")
     return points
@@ -256,10 +245,6 @@ class TargetError:
     rms: Float[np.ndarray, "*shape"]
     lower: Float[np.ndarray, "*shape"]
     upper: Float[np.ndarray, "*shape"]
-
-    def times(self, factor: float) -> TargetError:
-        """All of it multiplied by a factor."""
-        return TargetError(factor * self.rms, factor * self.lower, factor * self.upper)
 
 
 def tre_at(calibration: Calibration, points: Float[np.ndarray, "*points 2"]) -> TargetError:

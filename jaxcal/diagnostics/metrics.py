@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from jaxcal import InputError
 from jaxcal.runtime.array_types import AnyArray, Bool, Float
 from jaxcal.runtime.arrays import array_module, is_traced
-from jaxcal.runtime.given_values import real_array, truth_array
+from jaxcal.runtime.given_values import traceable_array, truth_array
 from jaxcal.runtime.jax_modes import traceable
 
 
@@ -36,8 +34,8 @@ def reconstruction_precision(
             and 1, or fewer than two images to count.
     """
     xp = array_module(image_to_probe, poses, points, mask)
-    image_to_probe = _numbers(image_to_probe, "image_to_probe")
-    poses, points = _numbers(poses, "poses"), _numbers(points, "points")
+    image_to_probe = traceable_array(image_to_probe, "image_to_probe")
+    poses, points = traceable_array(poses, "poses"), traceable_array(points, "points")
     if mask is not None and not is_traced(mask):
         mask = truth_array(mask, "mask")
     count = len(poses) if poses.ndim else 0
@@ -81,13 +79,6 @@ def reconstruct(
     return _transformed(xp.asarray(poses), in_probe)
 
 
-def _numbers(value: Any, name: str) -> Any:
-    """A caller's array, checked as far as it has values."""
-    if is_traced(value):
-        return array_module(value).asarray(value)
-    return real_array(value, name)
-
-
 def _transformed(transform: AnyArray, points: AnyArray) -> AnyArray:
     """Points (..., 3) by transforms (..., 4, 4)."""
     rotation, translation = transform[..., :3, :3], transform[..., :3, 3]
@@ -113,8 +104,8 @@ def calibration_reproducibility(
     Source: calibration reproducibility, e.g. Hsu et al. 2009, section 6.2.
     """
     xp = array_module(transforms, image_points)
-    transforms = _numbers(transforms, "transforms")
-    image_points = _numbers(image_points, "image_points")
+    transforms = traceable_array(transforms, "transforms")
+    image_points = traceable_array(image_points, "image_points")
     if transforms.ndim != 3 or transforms.shape[1:] != (4, 4) or len(transforms) < 2:
         raise InputError(
             f"transforms must have shape (k, 4, 4), at least two, not {transforms.shape}"

@@ -24,7 +24,7 @@ def noise_model(result: Calibration) -> dict[str, object]:
     """How well the noise model fits the residuals: scores by name, kurtosis, and complaints."""
     scores = np.asarray(result.inspection.misfit, dtype=float)
     return {
-        "checked": bool(int(result.images_used) >= FEWEST_TO_CHECK),
+        "checked": int(result.images_used) >= FEWEST_TO_CHECK,
         "kurtosis": [finite_or_none(value) for value in result.inspection.kurtosis],
         "scores": {
             name: [finite_or_none(value) for value in row]

@@ -35,8 +35,8 @@ _FAMILY = {
 }
 
 
-def law_distances(offsets: Float[np.ndarray, " n"]) -> dict[str, float]:
-    """The distance sqrt(n) D of the offsets from each law.
+def contradicted(offsets: Float[np.ndarray, " n"]) -> dict[str, bool]:
+    """Which laws the offsets contradict.
 
     Args:
         offsets: of the used images, mm; at least two, not all alike.
@@ -48,17 +48,11 @@ def law_distances(offsets: Float[np.ndarray, " n"]) -> dict[str, float]:
     middle = np.median(np.abs(centred - np.median(centred))) / MEDIAN_OF_STUDENT
     below, above = np.arange(count) / count, np.arange(1, count + 1) / count
     found = {}
-    for family in FAMILIES:
+    for family, limit in CONTRADICTED.items():
         expected = distribution(family, centred / (middle if family == "student" else spread))
         apart = np.maximum(expected - below, above - expected).max()
-        found[family] = float(np.sqrt(count) * apart)
+        found[family] = bool(np.sqrt(count) * apart > limit)
     return found
-
-
-def contradicted(offsets: Float[np.ndarray, " n"]) -> dict[str, bool]:
-    """Which laws the offsets contradict."""
-    apart = law_distances(offsets)
-    return {family: apart[family] > limit for family, limit in CONTRADICTED.items()}
 
 
 def distribution(family: str, u: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
@@ -83,10 +77,8 @@ def offset_law(result: Calibration) -> dict[str, object] | None:
     }
     own = float(law.own_probability)
     mean_probability = float(law.mean_probability)
-    words, wrong = (
-        "The distributions of the offsets could not be compared; Gaussian is assumed",
-        None,
-    )
+    words = "The distributions of the offsets could not be compared; Gaussian is assumed"
+    wrong = None
     if weighed:
         wrong = _contradicted(result)
         words = _law_in_words(probability, wrong)

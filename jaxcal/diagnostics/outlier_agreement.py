@@ -1,7 +1,8 @@
 """Do the images that were left out as outliers agree among themselves on another calibration?
 
-Then it is not said which of the two groups is right: a probe that was mounted anew, or a second
-echo. Each group is fitted conventionally, and the two fits are compared where they put the image.
+If they do (a probe that was mounted anew, a second echo), the data do not say which of the two
+groups is right. Each is fitted conventionally, and the two fits are compared by where they put the
+image.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ FEWEST_LEFT_OUT = 8
 """With fewer images left out there is no second group."""
 
 LEAST_SHARE = 0.2
-"""Nor is there if they are less than this share of the images in use."""
+"""Nor is there one if they are less than this share of the images in use."""
 
 LARGEST_SD_RATIO = 2.0
 """The images left out agree if the SD of their errors within the image, under a fit of their own,
@@ -66,7 +67,7 @@ def agreeing_outliers(
         own, problem, kept
     ):
         return None
-    stretch = _pixel_size(other, problem) / _pixel_size(own, problem)
+    stretch = pixel_size(other, problem) / pixel_size(own, problem)
     face = float(np.asarray(problem.face_offset))
     apart = distance(own.image_to_probe, other.image_to_probe, stretch, grid, face)
     if apart <= LEAST_APART * stated * math.sqrt(1 + kept.sum() / left.sum()):
@@ -81,7 +82,7 @@ def _sd_in_image(found: ClosedForm, problem: Problem, used: np.ndarray) -> float
     return math.sqrt(float(np.sum(off**2)) / freedom)
 
 
-def _pixel_size(found: ClosedForm, problem: Problem) -> Float[np.ndarray, " 2"]:
+def pixel_size(found: ClosedForm | Calibration, problem: Problem) -> Float[np.ndarray, " 2"]:
     """Lateral and axial size of a pixel, mm; ones for points in mm."""
     spacing = np.asarray(problem.spacing, float)
     return spacing if found.scale_mm_per_px is None else np.asarray(found.scale_mm_per_px)

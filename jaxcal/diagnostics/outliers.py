@@ -110,13 +110,12 @@ def suspects(result: Calibration) -> list[OutlierReason]:
 
 
 def suspects_in_words(result: Calibration) -> list[str]:
-    """The suspects in words; successive ones with errors of one kind and sign are joined."""
+    """The suspects in words; successive ones with errors of one sign are joined."""
     runs: list[list[OutlierReason]] = []
     for each in suspects(result):
         last = runs[-1][-1] if runs else None
-        alike = last is not None and each["component"] == last["component"]
         one_side = last is not None and (each["sds"] or 0) * (last["sds"] or 0) > 0
-        if last is not None and alike and one_side and each["image"] == last["image"] + 1:
+        if last is not None and one_side and each["image"] == last["image"] + 1:
             runs[-1].append(each)
         else:
             runs.append([each])

@@ -87,14 +87,9 @@ def assess(answer: Calibration, seen: ImageErrors, eps: float) -> Uncertainty:
     variance = np.asarray(linearisation.variance)
     scale = mm_at_target(seen.lever(kept), blocks)
     both = scale[:, :, None] * scale[:, None]
+    design = np.asarray(linearisation.design)
     whitened = answer.prior in TUNED
-    found = Spectra.of(
-        information / both,
-        np.asarray(linearisation.design) / both,
-        variance,
-        eps,
-        whitened=whitened,
-    )
+    found = Spectra.of(information / both, design / both, variance, eps, whitened=whitened)
     inverse = inverses(information, eps)
     size = np.where(np.isnan(found.weakest_sd), np.nan, variance)
     at_bound, elevation_sd = _offsets(answer, seen, inverse, size)
@@ -158,6 +153,17 @@ class Spectra:
             weakest = np.where(degenerate[:, None], nearest_unknown(unseen, null), weakest)
         sd = np.where(unknown, np.nan, np.sqrt(variance / smallest))
         return cls(values[:, -1] / smallest, weakest, sd)
+
+
+def rests_on_bound(
+    y: Float[AnyArray, "*batch n"], force: Float[AnyArray, "*batch n"], limit: AnyArray
+) -> Any:
+    """Whether each offset y (mm) rests on its bound (traceable).
+
+    There the cost falls outwards; ``force`` is half its derivative by y, mm.
+    """
+    xp = array_module(y, force, limit)
+    return (xp.abs(y) >= (1 - AT_BOUND) * limit) & (xp.sign(y) * force <= 0)
 
 
 def rounding(used: Float[AnyArray, "*batch"], lever: Float[AnyArray, "*batch"]) -> Any:
@@ -298,10 +304,8 @@ def _offsets(
         residual, axial = seen.from_circle(y)
         slope = y / axial
         limit = np.minimum(bound, LARGEST_ELEVATION * np.abs(seen.distance))
-        # Half the derivative of the cost by y; at an offset on its bound it points outwards.
         force = slope * residual[..., 2] - residual[..., 1]
-        near = np.abs(y) >= (1 - AT_BOUND) * limit
-        at_bound = (kept & near & (np.sign(y) * force <= 0)).astype(float)
+        at_bound = (kept & rests_on_bound(y, force, limit)).astype(float)
         rows = seen.circle_rows(axial)
         through = slope[..., None] * rows[..., 2, :] - rows[..., 1, :]
         weight = 1 + slope**2

@@ -13,3 +13,6 @@ FEWEST_IMAGES = 8
 
 MAD = 1.4826
 """SD of a normal law over the median of its magnitude."""
+
+STATIONARY = 1e-6
+"""Largest gradient cosine of an answer through which derivatives are valid; 1e-3 in float32."""

@@ -25,24 +25,14 @@ from jaxcal.design.candidates import seen_region
 from jaxcal.design.constraints import Region
 from jaxcal.diagnostics.gaussian_offsets import away_from_gaussian
 from jaxcal.diagnostics.image_errors import KINDS, ImageErrors, noise_covariance
-from jaxcal.diagnostics.influence import (
-    Influence,
-    conventional_fit,
-    excess,
-    in_image,
-    influence_of,
-)
-from jaxcal.diagnostics.intervals import (
-    image_jacobian,
-    predicted_tre,
-    tre_at,
-    tre_over,
-)
-from jaxcal.diagnostics.outlier_agreement import agreeing_outliers
+from jaxcal.diagnostics.influence import Influence, conventional_fit, excess, in_image, influence_of
+from jaxcal.diagnostics.intervals import image_jacobian, predicted_tre, tre_at, tre_over
+from jaxcal.diagnostics.outlier_agreement import agreeing_outliers, pixel_size
 from jaxcal.diagnostics.unmodelled import unmodelled
 from jaxcal.model.image_points import distance, mean_of_squares
 from jaxcal.report.contradictions import contradictions
 from jaxcal.result.calibration import Calibration
+from jaxcal.result.saved import ASKED_FOR
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.given_values import real_array
 from jaxcal.solvers.closed_form.single import solve_problem
@@ -99,7 +89,7 @@ def accuracy_record(
         "tre": tre,
         "limits": _limits(answer, found, weight),
         "influence": influence,
-        "comparison": _comparison(answer, found, grid),
+        "comparison": _comparison(answer, found, weight, grid),
     }
 
 
@@ -139,7 +129,7 @@ def _tre(
             raise InputError(f"tre_points must be pairs of numbers, not of shape {given.shape}")
         if not (np.abs(given) <= LARGEST).all():
             raise InputError(f"points of --tre must be numbers up to {LARGEST:g}")
-        names += ("asked for",) * len(given)
+        names += (ASKED_FOR,) * len(given)
         image = np.concatenate([image, given])
         places = np.concatenate([places, transform._in_plane(given)[:, [0, 2]]])
     at = tre_at(answer, places)
@@ -206,8 +196,8 @@ def error_shares(
     part = np.einsum("pq,kpq->k", weight, found.shares)
     if not np.isfinite(part).all() or not part.sum() > 0:
         return np.full(len(KINDS), np.nan)
-    if answer.prior in ("none", "bounded"):
-        # These weigh all kinds alike: scale the shares by the kinds' own variances.
+    if answer.prior == "bounded":
+        # All kinds have one variance there: scale the shares by the kinds' own variances.
         part = part * np.asarray(answer.sigma, float) ** 2
     return part / part.sum()
 
@@ -241,7 +231,10 @@ def _unmodelled(answer: Calibration, grid: Float[np.ndarray, "m 2"]) -> dict[str
 
 
 def _comparison(
-    answer: Calibration, found: Influence, grid: Float[np.ndarray, "m 2"]
+    answer: Calibration,
+    found: Influence,
+    weight: Float[np.ndarray, "p p"],
+    grid: Float[np.ndarray, "m 2"],
 ) -> dict[str, Any] | None:
     """Compares an answer of another method with the conventional fit of the same images."""
     estimate = ("scale",) if "scale" in answer.blocks else ()
@@ -254,24 +247,18 @@ def _comparison(
         other = solve_problem(replace(problem, mask=answer.mask), estimate)
     except InputError:
         return None
-    x, spacing = np.asarray(other.image_to_probe), np.asarray(problem.spacing, float)
-    scale = np.ones(2)
-    if other.scale_mm_per_px is not None:
-        scale = np.asarray(other.scale_mm_per_px) / spacing
     noise = np.asarray(noise_covariance(answer, problem), float)
     if not np.isfinite(noise[used]).all():
         return None
     seen = ImageErrors.of_closed_form(other, problem, answer.blocks)
     covariance, log_density = conventional_fit(seen, used, noise)
-    jacobian = image_jacobian(answer, grid)
-    error = np.einsum("mia,ab,mib->", jacobian, covariance, jacobian) / len(grid)
-    gaussian = np.einsum("mia,ab,mib->", jacobian, found.model_covariance, jacobian) / len(grid)
+    error = float(np.sum(weight * covariance))
+    gaussian = float(np.sum(weight * found.model_covariance))
     # Compare where both calibrations put the image's pixels on the probe.
-    mine = np.ones(2)
-    if answer.scale_mm_per_px is not None:
-        mine = np.asarray(answer.scale_mm_per_px) / spacing
+    stretch = pixel_size(other, problem) / pixel_size(answer, problem)
     face = float(np.asarray(problem.face_offset))
-    apart = distance(np.asarray(answer.image_to_probe), x, scale / mine, grid, face)
+    x = np.asarray(other.image_to_probe)
+    apart = distance(np.asarray(answer.image_to_probe), x, stretch, grid, face)
     density = found.log_density - log_density
     gain = spread = None
     # Within a bound, offsets fit themselves: their errors are zero, and have no density.

@@ -84,14 +84,15 @@ def _from_images(record: dict[str, Any]) -> list[tuple[float, str]]:
     moved, how = influence["moved_mm"], "to first order"
     if held is not None and held["folds"] == len(moved):
         moved, how = held["image_moved_mm"], "by a calibration without it"
-    worst, size = None, 0.0
-    for image, (by, should) in enumerate(zip(moved, influence["expected_mm"], strict=True)):
-        if by is None or should is None or by <= max(MOVED_SHARE * stated, MOVED_TIMES * should):
-            continue
-        if by > size:
-            worst, size = image, by
-    if worst is None:
+    found = [
+        (by, image)
+        for image, (by, should) in enumerate(zip(moved, influence["expected_mm"], strict=True))
+        if by is not None and should is not None
+        if by > max(MOVED_SHARE * stated, MOVED_TIMES * should)
+    ]
+    if not found:
         return []
+    size, worst = max(found)
     words = f"image {worst} alone changes the calibration by {size:.2f} mm in the image ({how})"
     return [(math.hypot(1.0, size / stated), words)]
 
@@ -225,7 +226,7 @@ def _from_limits(record: dict[str, Any]) -> list[tuple[float, str]]:
 
 
 def _scatter(scatter: float, stated: float) -> str:
-    """Of corners and middle of the part of the image in which targets were seen."""
+    """Words for a scatter at corners and middle of the part in which targets were seen, mm."""
     return (
         f"scatter by {scatter:.2f} mm where targets were seen, {scatter / stated:.1f} times as "
         f"much as the covariance states ({stated:.2f} mm)"

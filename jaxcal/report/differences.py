@@ -21,7 +21,7 @@ def what_differs(
     Args:
         names: of the probe's frame; Probe where none is known.
         sizes: [lateral, axial] of a pixel, mm.
-        whose: what these are those of.
+        whose: the two in words: the first, say.
     """
     words = []
     if len({*names} - {"Probe"}) == 2:

@@ -14,8 +14,8 @@ from jaxcal.result.calibration import Calibration
 COUNT = 3
 _CANDIDATES = 2000
 NOT_PLANNED = "delay"
-"""The unknown without which a plan is wrong: it and the axial translation make up for each other,
-so that both have a large SD, and an image point a small one."""
+"""The unknown with which no poses are planned: it and the axial translation compensate each other.
+Both then have large SDs, and an image point a small one, which a plan would predict wrongly."""
 
 
 def next_poses_record(

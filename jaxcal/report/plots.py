@@ -37,7 +37,7 @@ _ROUNDING = 3e-14
 _ALONG_A_SIDE = 61
 """Points along each side of the map of the error."""
 COLOURS = {"lateral": BLUE, "range": GREEN, "axial": GREEN, "elevational": ORANGE}
-"""Of each kind of error."""
+"""Colours of the kinds of error."""
 
 
 def canvas(width_mm: float, height_mm: float) -> Figure:

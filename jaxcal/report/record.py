@@ -19,7 +19,6 @@ from jaxcal.diagnostics.outliers import outlier_reasons, outliers, suspects
 from jaxcal.model.unknowns import (
     TABLE,
     block_slice,
-    in_image,
     measured,
     split_further,
     tangent_names,
@@ -106,8 +105,7 @@ def calibration_record(
     images = solved.calibration if tested is None else tested
     scale = answer.scale_mm_per_px
     transform = answer.image_transform()
-    full, rows = answer.unknowns_covariance, in_image(answer.blocks)
-    known = bool(np.isfinite(full).all())
+    known = transform.covariance is not None
     frames = recording.pose_frames
     record: dict[str, Any] = {
         "format": FORMAT,
@@ -132,9 +130,9 @@ def calibration_record(
         "sigma_range_mm": answer.sigma[1],
         "sigma_elevation_mm": answer.sigma[2],
         "tracker_sd_mm": answer.linearisation.tracker_sd,
-        "covariance": answer.covariance if known else None,
+        "covariance": transform.covariance,
         "image_unknowns": tangent_names(transform.unknowns),
-        "image_covariance": full[rows[:, None], rows] if known else None,
+        "image_covariance": transform.image_covariance,
         "point_covariance_mm2": answer.point_covariance if known else None,
         "observability": result.observability,
         "rms_mm": answer.rms,

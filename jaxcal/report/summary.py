@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxcal.data.recording import Images, Recording
 from jaxcal.report.record import calibration_record
-from jaxcal.result.calibration import Calibration, check_one, data_of
+from jaxcal.result.calibration import Calibration, batch_in_words, check_one, data_of
 
 
 def recording_of(calibration: Calibration) -> Recording:
@@ -81,13 +81,9 @@ def batch_text(calibration: Calibration) -> str:
 
     Wrong frames are not counted: looking for them takes milliseconds for each calibration.
     """
-    status = np.asarray(calibration.status)
-    names, counts = np.unique(status, return_counts=True)
-    told = ", ".join(f"{count} {name}" for name, count in zip(names, counts, strict=True))
-    shape = " x ".join(map(str, status.shape))
     return (
-        f"Calibration of a batch of {shape}: {told or 'empty'}. Frames and units are not checked "
-        "here, but in each calibration: batch[0] is the first"
+        f"Calibration of a {batch_in_words(calibration)}. Frames and units are not checked here, "
+        "but in each calibration: batch[0] is the first"
     )
 
 

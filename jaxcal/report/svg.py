@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from html import escape
 from typing import Any
 
@@ -73,9 +74,9 @@ def viridis(share: Number) -> str:
 
 
 def ticks(low: Number, high: Number, most: int = 6) -> list[Any]:
-    """Round numbers between two others, at most ``most`` of them, or two more to have a second.
+    """Round numbers between two others, at most ``most`` of them.
 
-    A single number would tell no scale.
+    If that leaves a single one, which shows no scale, more are allowed.
     """
     if not high > low:
         return [low]
@@ -150,25 +151,21 @@ def figure(height: Number, parts: Iterable[str], label: str) -> str:
     )
 
 
+@dataclass(frozen=True)
 class Panel:
     """A rectangle with two linear axes.
 
-    Args:
+    Attributes:
         box: left, top, right and bottom, in the figure's units.
         x: least and greatest value.
         y: the same; the greatest is on top unless ``down``.
         down: y grows downwards, as depth does.
     """
 
-    def __init__(
-        self,
-        box: tuple[Number, Number, Number, Number],
-        x: tuple[Number, Number],
-        y: tuple[Number, Number],
-        *,
-        down: bool = False,
-    ) -> None:
-        self.box, self.x, self.y, self.down = box, x, y, down
+    box: tuple[Number, Number, Number, Number]
+    x: tuple[Number, Number]
+    y: tuple[Number, Number]
+    down: bool = False
 
     def place(self, x: Number, y: Number) -> tuple[Any, Any]:
         """The position of a point in the figure."""

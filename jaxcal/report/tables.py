@@ -11,6 +11,7 @@ from rich.table import Table
 
 from jaxcal.report.certified import certificate_words
 from jaxcal.report.verdict import spread_of_transform, title_of_transform
+from jaxcal.result.saved import ASKED_FOR
 from jaxcal.runtime.messages import counted
 
 _UNKNOWN = "-"
@@ -149,7 +150,7 @@ def _accuracy(record: dict[str, Any]) -> list[tuple[str, str]]:
     for point in tre["points"]:
         u, v = point["image"]
         place = f"{point['name']} ({u:z.0f}, {v:z.0f})"
-        if point["name"] == "asked for":
+        if point["name"] == ASKED_FOR:
             place = f"({u:g}, {v:g})"
         error = shown(point["tre_mm"], point["interval_95_mm"])
         facts.append((f"  at {place} {tre['unit']}", error))

@@ -12,6 +12,7 @@ from typing import Any
 from jaxcal.diagnostics.warnings import WEAK_MM
 from jaxcal.report.paragraphs import listed
 from jaxcal.report.resampled import resampled_sentences
+from jaxcal.result.saved import ASKED_FOR
 from jaxcal.solvers.plan import TUNED
 
 FEW_IMAGES = 20
@@ -140,7 +141,7 @@ def where(record: dict[str, Any]) -> list[str]:
     tre = record.get("tre")
     if tre is None or tre.get("rms_mm") is None:
         return []
-    named = {point["name"]: point for point in tre["points"] if point["name"] != "asked for"}
+    named = {point["name"]: point for point in tre["points"] if point["name"] != ASKED_FOR}
     # The mean square error is convex, so that it is largest in a corner; it is smallest anywhere.
     worst = max(named.values(), key=lambda point: point["tre_mm"])
     lines = [
@@ -155,7 +156,7 @@ def where(record: dict[str, Any]) -> list[str]:
             f"depth {near} to {far} mm); elsewhere the error may be larger."
         )
     for point in tre["points"]:
-        if point["name"] == "asked for":
+        if point["name"] == ASKED_FOR:
             low, high = point["interval_95_mm"]
             u, v = point["image"]
             lines.append(

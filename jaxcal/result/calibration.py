@@ -19,7 +19,15 @@ from jaxcal.result.findings import Inspection, Summary
 from jaxcal.result.saved import check_target, dated
 from jaxcal.result.transform import AppliedPoints, ImageTransform, SaveFormat
 from jaxcal.runtime.array_types import AnyArray, Bool, Float, Int
-from jaxcal.runtime.arrays import array_module, array_tree, is_traced, map_arrays, static
+from jaxcal.runtime.arrays import (
+    array_module,
+    array_tree,
+    has_values,
+    is_traced,
+    map_arrays,
+    outline,
+    static,
+)
 from jaxcal.solvers.convergence import Convergence
 
 if TYPE_CHECKING:
@@ -321,9 +329,7 @@ class Calibration:
         Raises:
             CalibrationError: under jit, vmap or grad, where there is no text: use ``status_code``.
         """
-        names = np.array([status.name.lower() for status in Status])
-        chosen = names[self._concrete(self.status_code)]
-        return str(chosen) if chosen.ndim == 0 else chosen
+        return status_names(self._concrete(self.status_code))
 
     @cached_property
     def _summary(self) -> Summary:
@@ -572,9 +578,19 @@ class Calibration:
 
         return plots.plot_limits(self)
 
+    def __repr__(self) -> str:
+        """Method, how it ended, number of images and residual; not the arrays."""
+        if not has_values(self.mask, self.status_code, self.rms):
+            return outline(self)
+        how = self.method if self.prior == "none" else f"{self.method}, prior {self.prior}"
+        if np.ndim(self.mask) != 1:
+            return f"Calibration({how}, {batch_in_words(self)})"
+        count = f"{np.count_nonzero(np.asarray(self.mask) > 0)} used of {len(self.mask)} images"
+        return f"Calibration({how}, {self.status}, {count}, RMS {float(self.rms):.3g} mm)"
+
     def __str__(self) -> str:
-        """Table and verdict; for a batch how many converged; without values, the fields."""
-        if not self._has_values():
+        """Table and verdict; for a batch how many converged; without data or values, the repr."""
+        if not self._is_complete():
             return repr(self)
         from jaxcal.report import summary
 
@@ -584,16 +600,16 @@ class Calibration:
 
     def _repr_html_(self) -> str | None:
         """HTML for notebooks; None, so that the text is shown, if there is nothing to draw."""
-        if not self._has_values() or np.ndim(self.mask) != 1:
+        if not self._is_complete() or np.ndim(self.mask) != 1:
             return None
         from jaxcal.report.summary import html_of
 
         return html_of(self)
 
-    def _has_values(self) -> bool:
-        """False while traced, and if ``jax.tree.map`` or ``jax.eval_shape`` replaced the arrays."""
-        arrays = hasattr(self.mask, "__array__") and hasattr(self.status_code, "__array__")
-        return self.problem is not None and arrays and not is_traced(self)
+    def _is_complete(self) -> bool:
+        """Whether it holds its data, and values everywhere."""
+        complete = self.problem is not None and has_values(self.mask, self.status_code)
+        return complete and not is_traced(self)
 
     def numpy(self) -> Calibration:
         """The same calibration with numpy arrays (concrete values).
@@ -616,10 +632,23 @@ class Calibration:
         return np.asarray(value)
 
 
+def status_names(status_code: Int[np.ndarray, "*batch"]) -> str | np.ndarray:
+    """The name of a :class:`Status`, or of each in an array."""
+    chosen = np.array([status.name.lower() for status in Status])[status_code]
+    return str(chosen) if chosen.ndim == 0 else chosen
+
+
 def check_one(status_code: Int[AnyArray, "*batch"]) -> None:
     """Raise InputError where each calibration of a batch has a status."""
     if np.ndim(status_code):
         raise InputError("a batch holds many calibrations: take one of them, batch[0]")
+
+
+def batch_in_words(batch: Calibration) -> str:
+    """The size of a batch, and how many of its calibrations ended with each status."""
+    names, counts = np.unique(batch.status, return_counts=True)
+    told = ", ".join(f"{count} {name}" for name, count in zip(names, counts, strict=True))
+    return f"batch of {' x '.join(map(str, np.shape(batch.status)))}: {told or 'empty'}"
 
 
 def data_of(calibration: Calibration) -> Problem:

@@ -1,4 +1,4 @@
-"""What is found out about an answer when it is first asked for (:mod:`jaxcal.diagnostics`)."""
+"""Results of :mod:`jaxcal.diagnostics`, which are computed when one of them is first read."""
 
 from __future__ import annotations
 

@@ -25,6 +25,9 @@ FORMAT = "jaxcal-calibration"
 VERSION = 1
 MAXIMUM_BYTES = 64 * 2**20
 
+ASKED_FOR = "asked for"
+"""Name of those points of ``tre`` that a caller named; all others are of the region."""
+
 _IN_THE_PLANE = ("scale_mm_per_px", "face_offset_mm", "range_factor")
 """What takes an image point to the image plane; no part of the rigid transform."""
 
@@ -282,26 +285,26 @@ def load_calibration(path: str | os.PathLike[str]) -> ImageTransform:
     with naming(path):
         if os.path.isfile(os.path.join(name, "calibration.json")):
             raise FormatError("is a folder: name the calibration.json in it")
-        if lower.endswith(".xml"):
+        if lower.endswith(_EXTENSIONS["plus"]):
             from jaxcal.io.plus import read_transform
 
             found = read_transform(path)
             _check_calibrated(found.matrix)
             made = transform_from_plus_matrix(found.matrix, error_mm=found.error_mm, source=name)
             return replace(made, probe_frame=found.target)
-        if lower.endswith((".tfm", ".txt", ".h5")):
+        if lower.endswith(_EXTENSIONS["itk"]):
             from jaxcal.io.itk import read_itk
 
             matrix = read_itk(path)
             _check_calibrated(matrix)
             return transform_from_plus_matrix(matrix, source=name)
-        if lower.endswith(".csv"):
+        if lower.endswith(_EXTENSIONS["tusrec"]):
             from jaxcal.io.tus_rec import read_calib_matrix
 
             rigid, scale = read_calib_matrix(path)
             matrix = rigid @ np.diag([*scale, scale.mean(), 1.0])
             return transform_from_plus_matrix(matrix, source=name)
-        if lower.endswith((".yaml", ".yml")):
+        if lower.endswith(_EXTENSIONS["ros"]):
             from jaxcal.io.ros import read_ros_yaml
 
             matrix, held = read_ros_yaml(path)
@@ -316,17 +319,19 @@ def load_calibration(path: str | os.PathLike[str]) -> ImageTransform:
 
 
 def stated_points(path: str | os.PathLike[str]) -> np.ndarray | None:
-    """The image points at which a JSON of ours states its error: middle and corners, (m, 2).
+    """Middle and corners of the image, for which a JSON of ours states its error, (m, 2).
 
-    They are in px, or mm where the calibration has no pixels; None if the file holds none.
+    They are in px, or mm where the calibration has no pixels; None if the file holds none. Points
+    that a caller asked for are not among them: they may lie anywhere.
 
     Raises:
         FormatError: a ``.json`` that is no JSON object.
     """
     stated = _stated(path, "tre")
     try:
-        points = np.array([each["image"] for each in stated["points"]], dtype=np.float64)  # pyright: ignore[reportOptionalSubscript]
-    except (TypeError, KeyError, ValueError, OverflowError):
+        corners = [each for each in stated["points"] if each.get("name") != ASKED_FOR]
+        points = np.array([each["image"] for each in corners], dtype=np.float64)
+    except (AttributeError, TypeError, KeyError, ValueError, OverflowError):
         return None
     sound = points.ndim == 2 and points.shape[1] == 2 and np.isfinite(points).all()
     return points if sound else None
@@ -419,33 +424,32 @@ def transform_from_record(record: dict[str, Any], *, source: str = "memory") -> 
     usable = record.get("converged")
     if not (usable is None or isinstance(usable, bool)):
         raise FormatError("converged must be true, false or null")
-    scale = _array(record, "scale_mm_per_px", (2,))
-    offset = _array(record, "face_offset_mm", ())
-    factor = _array(record, "range_factor", ())
-    error = _array(record, "rms_mm", ())
-    tre = record.get("tre")
-    times = _array(tre, "factor", ()) if isinstance(tre, dict) else None
-    date, frames = record.get("date"), record.get("pose_frames")
-    named = frames.get("from") if isinstance(frames, dict) else None
+    tre, frames = (
+        found if isinstance(found, dict) else {}
+        for found in (record.get("tre"), record.get("pose_frames"))
+    )
+    date, named = record.get("date"), frames.get("from")
     if not (date is None or isinstance(date, str)):
         raise FormatError("date must be text")
-    usable = usable and not record.get("wrong_frames")
     unknowns = _unknowns(record)
     size = len(tangent_names(unknowns))
+    given = {
+        "scale_mm_per_px": _array(record, "scale_mm_per_px", (2,)),
+        "face_offset_mm": _array(record, "face_offset_mm", ()),
+        "range_factor": _array(record, "range_factor", ()),
+        "error_mm": _array(record, "rms_mm", ()),
+        "tre_factor": _array(tre, "factor", ()),
+        "covariance": _array(record, "covariance", (6, 6)),
+        "image_covariance": _array(record, "image_covariance", (size, size)),
+        "probe_frame": named if isinstance(named, str) else None,
+    }
     return ImageTransform(
         matrix,
-        scale,
-        0.0 if offset is None else float(offset),
-        _array(record, "covariance", (6, 6)),
-        None if error is None else float(error),
-        usable,
-        source,
-        1.0 if factor is None else float(factor),
-        unknowns,
-        _array(record, "image_covariance", (size, size)),
-        date,
-        named if isinstance(named, str) else "Probe",
-        1.0 if times is None else float(times),
+        converged=usable and not record.get("wrong_frames"),
+        source=source,
+        unknowns=unknowns,
+        date=date,
+        **{name: value for name, value in given.items() if value is not None},
     )
 
 
@@ -461,7 +465,8 @@ def _unknowns(record: dict[str, Any]) -> tuple[str, ...]:
     return blocks
 
 
-def _array(record: dict[str, Any], key: str, shape: tuple[int, ...]) -> np.ndarray | None:
+def _array(record: dict[str, Any], key: str, shape: tuple[int, ...]) -> Any:
+    """An array, a float for the shape (), or None."""
     value = record.get(key)
     if value is None:
         return None
@@ -472,7 +477,7 @@ def _array(record: dict[str, Any], key: str, shape: tuple[int, ...]) -> np.ndarr
     if array.shape != shape:
         raise FormatError(f"{key} must have shape {shape}, it has {array.shape}")
     if np.isfinite(array).all():
-        return array
+        return array if shape else float(array)
     # If the solve had failed, there may be NaN instead of null.
     if record.get("converged") is not False:
         raise FormatError(f"{key} holds NaN or Inf")

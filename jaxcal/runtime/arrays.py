@@ -35,6 +35,9 @@ _STATIC = "static"
 
 _SHAPE = re.compile(r"""\[[^\[\]]*["']([^"']*)["']\]""")
 
+_LONGEST_SHOWN = 16
+"""Numbers in an array that a ``repr`` writes out: a 4x4 transform."""
+
 _numpy_alone: ContextVar[bool] = ContextVar("jaxcal_numpy_alone", default=False)
 """Whether the calculation that runs here began without JAX."""
 
@@ -90,11 +93,33 @@ def static(*, default: Any = dataclasses.MISSING) -> Any:
 def array_tree(kind: type[T]) -> type[T]:
     """Decorate a class: a frozen dataclass, and a pytree of its fields but for :func:`static` ones.
 
-    Instances compare by identity, as arrays have no single truth value.
+    Instances compare by identity, as arrays have no single truth value. Their ``repr`` has the
+    shapes of long arrays instead of the numbers.
     """
-    kind = dataclasses.dataclass(frozen=True, eq=False)(kind)
+    kind = dataclasses.dataclass(frozen=True, eq=False, repr=False)(kind)
+    if "__repr__" not in vars(kind):
+        kind.__repr__ = outline  # pyright: ignore[reportAttributeAccessIssue]
     when_jax_is_imported(partial(_register, kind))
     return kind
+
+
+def outline(tree: Any) -> str:
+    """The fields of a tree; long arrays, and those without values as under jit, by their shape."""
+
+    def short(value: Any) -> str:
+        small = has_values(value) and np.size(value) <= _LONGEST_SHOWN
+        if small or not hasattr(value, "shape"):
+            return repr(value)
+        return f"{value.dtype}[{','.join(map(str, value.shape))}]"
+
+    names = (field.name for field in dataclasses.fields(tree))
+    told = ", ".join(f"{name}={short(getattr(tree, name))}" for name in names)
+    return f"{type(tree).__name__}({told})"
+
+
+def has_values(*arrays: Any) -> bool:
+    """False while traced, and if ``jax.tree.map`` or ``jax.eval_shape`` replaced the arrays."""
+    return all(hasattr(each, "__array__") for each in arrays) and not is_traced(*arrays)
 
 
 def assembled(kind: type[T], values: dict[str, Any]) -> T:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from jaxcal import InputError
+from jaxcal.runtime.arrays import array_module, is_traced
 from jaxcal.runtime.messages import shown
 
 LARGEST_SEED = 2**63 - 1
@@ -31,6 +32,11 @@ def real_array(value: Any, name: str) -> np.ndarray:
     except (TypeError, ValueError, OverflowError):
         pass
     raise InputError(f"{name} must be an array of real numbers")
+
+
+def traceable_array(value: Any, name: str) -> Any:
+    """:func:`real_array` of values; a traced array, which has none, is only made an array."""
+    return array_module(value).asarray(value) if is_traced(value) else real_array(value, name)
 
 
 def refuse_masked(value: Any, name: str) -> None:
