@@ -344,9 +344,9 @@ class _Laws(eqx.Module):
     ) -> tuple[_Propagation, Posterior]:
         """Take ``sweeps`` sweeps under a law; the evidence is that before the last one."""
 
-        def sweep(_: Array, carry: tuple) -> tuple:
+        def sweep(k: Array, carry: tuple) -> tuple:
             before, _ = carry
-            after, evidence, dominated = self.sweep(family, sd, before)
+            after, evidence, dominated = self.sweep(family, sd, before, k == sweeps - 1)
             step = after.belief.mean - before.belief.mean
             length = jnp.sum(
                 step * dense.product_batch_last(after.belief.information, step), axis=0
@@ -359,9 +359,12 @@ class _Laws(eqx.Module):
         return state, Posterior(state.belief.mean, state.belief.covariance, evidence, change)
 
     def sweep(
-        self, family: Array, sd: Float[Array, " batch"], state: _Propagation
+        self, family: Array, sd: Float[Array, " batch"], state: _Propagation, last: Array
     ) -> tuple[_Propagation, Array, Array]:
-        """Update all sites once; the log evidence before, and where a site dominates the others."""
+        """Update all sites once; the log evidence before, and where a site dominates the others.
+
+        These two are computed in the last sweep, and are without meaning in the others.
+        """
         h, offset, used = self.sites.direction, self.sites.offset, self.sites.used
         tau, nu, belief = state.tau, state.nu, state.belief
         variance = self.sites.variance(belief.covariance)
@@ -373,21 +376,26 @@ class _Laws(eqx.Module):
         ways = [partial(tilted, name, interval=self.sites.interval) for name in self.families]
         found = jax.lax.switch(family, ways, sd, centre, without)
 
+        def judged() -> tuple[Array, ...]:
+            joined = 1 + tau * without
+            site = found.log_factor + jnp.log(found.mass * jnp.sqrt(joined))
+            site = site - 0.5 * ((centre + without * nu) ** 2 / joined - centre**2) / without
+            site = site + nu * offset - 0.5 * tau * offset**2
+            dominated = jnp.where(tau * without > 0.99 / LEAST_ROOM, used, 0.0)
+            return tuple(total([used * site, dominated]))
+
         # The evidence is stationary in the sites, so it is as good before the last sweep as after.
-        joined = 1 + tau * without
-        site = found.log_factor + jnp.log(found.mass * jnp.sqrt(joined))
-        site = site - 0.5 * ((centre + without * nu) ** 2 / joined - centre**2) / without
-        site = site + nu * offset - 0.5 * tau * offset**2
-        dominated = jnp.where(tau * without > 0.99 / LEAST_ROOM, used, 0.0)
+        none = jnp.zeros_like(sd)
+        site, dominated = jax.lax.cond(last, judged, lambda: (none, none))
 
         new_tau, new_nu = refreshed(found, centre, without)
         tau = tau + DAMPING * used * (new_tau - tau)
         nu = nu + DAMPING * used * (new_nu - nu)
-        tau, nu, site, dominated = barrier((tau, nu, used * site, dominated))
+        tau, nu = barrier((tau, nu))
         weighted = [tau * row for row in h]
         force = nu - tau * offset
         planes = [weighted[i] * h[j] for i, j in TRIANGLE]
-        *sums, site, dominated = total([*planes, *(force * row for row in h), site, dominated])
+        sums = total([*planes, *(force * row for row in h)])
         evidence = belief.evidence(site)
         size = len(TRIANGLE)
         after = _solved(
