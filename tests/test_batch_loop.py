@@ -12,7 +12,7 @@ from conftest import problem
 from jaxtyping import Array
 
 import jaxcal
-from jaxcal.model.batch import ImagePlanes
+from jaxcal.model.batch import ImagePlanes, Iterate
 from jaxcal.model.observations import OwnCovariances
 from jaxcal.model.unknowns import RIGID
 from jaxcal.solvers import batch_loop
@@ -57,13 +57,19 @@ def test_a_solver_does_not_notice(monkeypatch):
     monkeypatch.setattr(batch_loop, "LARGE_BATCH", 24)
     draws = np.random.default_rng(3)
     problems = jaxcal.stack([problem(seed, images=8, noise_mm=0.3) for seed in range(24)])
-    images = ImagePlanes.of(problems)
-    start, *_ = closed_form(images, RIGID)
-    far = jnp.zeros((9, 24)).at[4, -1].set(1.0)  # only this one is still active in the end
-    start = start.moved(far)
+    far = np.zeros((9, 24))
+    far[4, -1] = 1.0  # only this one is still active in the end
     shape = jnp.asarray(draws.uniform(0.5, 2, (3, 24, 8)) * [[[1]], [[0.1]], [[1]]])
-    sigma = jnp.asarray(draws.uniform(0.1, 1, (3, 24)))
-    observation = OwnCovariances(sigma, shape, sigma[1] / sigma[0])
+    sigma = draws.uniform(0.1, 1, (3, 24))
+    observation = OwnCovariances(jnp.asarray(sigma), shape, jnp.asarray(sigma[1] / sigma[0]))
+
+    @jax.jit
+    def begun(problems: jaxcal.Problem) -> tuple[Iterate, ImagePlanes]:
+        images = ImagePlanes.of(problems)
+        start, *_ = closed_form(images, RIGID)
+        return start.moved(jnp.asarray(far)), images
+
+    start, images = begun(problems)
 
     def solved(*, together: bool) -> Minimum:
         solve = jax.jit(partial(minimise, max_steps=30, together=together))

@@ -1,4 +1,4 @@
-"""A batch shared out among devices."""
+"""A batch shared out among devices, and arrays that are on a device already."""
 
 from __future__ import annotations
 
@@ -12,29 +12,52 @@ from conftest import problem
 import jaxcal
 
 PROGRAM = """
-import sys
+import dataclasses
 import jax
 import numpy as np
 import jaxcal
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 jax.config.update("jax_enable_x64", True)
+first, second = jax.devices()
 given = np.load("given.npz")
-each = [jaxcal.Problem.from_arrays(given["poses"], points) for points in given["points"]]
-found = jaxcal.calibrate_batch(each, method="conventional")
-np.save("found.npy", np.concatenate([[len(found.rms.devices())], found.image_to_probe.ravel()]))
+problems = jaxcal.stack(
+    [jaxcal.Problem.from_arrays(given["poses"], points) for points in given["points"]]
+)
+free = jaxcal.calibrate_batch(problems, method="conventional")
+assert free.rms.devices() == {first, second}
+np.save("found.npy", free.image_to_probe)
+there = jaxcal.calibrate_batch(jax.device_put(problems, second), "conventional")
+assert there.rms.devices() == {second}, there.rms.devices()
+np.testing.assert_allclose(there.image_to_probe, free.image_to_probe, atol=1e-9)
+sharding = NamedSharding(Mesh(np.array([first, second]), "k"), PartitionSpec("k"))
+spread = jaxcal.calibrate_batch(jax.device_put(problems, sharding), "conventional", chunk=2)
+assert spread.rms.devices() == {first, second}
+np.testing.assert_allclose(spread.image_to_probe, free.image_to_probe, atol=1e-9)
+torn = jax.device_put(problems, second)
+torn = dataclasses.replace(torn, poses=jax.device_put(problems.poses, first))
+try:
+    jaxcal.calibrate_batch(torn, "conventional")
+except jaxcal.InputError as error:
+    print(error)
 """
 
 
-def test_results_do_not_depend_on_the_number_of_devices(tmp_path):
+def test_results_do_not_depend_on_the_devices_and_stay_there(tmp_path):
     there = problem(1, images=12, noise_mm=0.5)
     noise = np.random.default_rng(0).normal(0, 0.5, (70, 12, 2))
     given = {"poses": np.asarray(there.poses), "points": np.asarray(there.measurements) + noise}
     np.savez(tmp_path / "given.npz", **given)
-    environment = os.environ | {"JAX_NUM_CPU_DEVICES": "2", "JAX_PLATFORMS": "cpu"}
-    subprocess.run([sys.executable, "-c", PROGRAM], env=environment, cwd=tmp_path, check=True)
-    two = np.load(tmp_path / "found.npy")
+    done = subprocess.run(
+        [sys.executable, "-W", "error::DeprecationWarning:__main__", "-c", PROGRAM],
+        env=os.environ | {"JAX_NUM_CPU_DEVICES": "2", "JAX_PLATFORMS": "cpu"},
+        capture_output=True, text=True, cwd=tmp_path,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "different devices" in done.stdout
     each = [jaxcal.Problem.from_arrays(given["poses"], points) for points in given["points"]]
     one = jaxcal.calibrate_batch(each, method="conventional")
-    assert (len(one.rms.devices()), two[0]) == (1, 2)
+    assert len(one.rms.devices()) == 1
     # One device runs a program that is kept, for whole chunks: other sums, the same but rounding.
-    np.testing.assert_allclose(one.image_to_probe.ravel(), two[1:], rtol=0, atol=1e-11)
+    two = np.load(tmp_path / "found.npy")
+    np.testing.assert_allclose(one.image_to_probe, two, rtol=0, atol=1e-11)

@@ -200,6 +200,7 @@ def test_what_the_pieces_cannot_take_is_said_in_a_sentence():
         jaxcal.simulate_recording(jaxcal.Protocol(images=12), seed=1)
     )
     batch = jaxcal.stack([one, one])
+    images = jax.jit(backend.ImagePlanes.of)(batch)
     somewhere = Parameters.of(jnp.eye(3), jnp.zeros(3), jnp.zeros(3))
     for call, said in (
         (lambda: backend.initial_fit(batch), "takes one problem"),
@@ -211,7 +212,7 @@ def test_what_the_pieces_cannot_take_is_said_in_a_sentence():
                         jax.tree.map(lambda a: jnp.stack([a] * count), somewhere), backend.RIGID
                     ),
                     backend.Points(sigma),
-                    backend.ImagePlanes.of(batch),
+                    images,
                 ),
                 f"{name} must be of 2 problems",
             )
@@ -242,7 +243,7 @@ def test_what_the_pieces_cannot_take_is_said_in_a_sentence():
             "'angle' is no unknown: choose from trans",
         ),
         (
-            lambda: backend.retract(backend.initial_fit(one), jnp.zeros(6), backend.RIGID),
+            lambda: backend.retract(somewhere, jnp.zeros(6), backend.RIGID),
             "a step of translation, rotation, point has 9 numbers",
         ),
         (lambda: backend.LevenbergMarquardt(damping=-1.0), "damping must be .* not -1.0"),

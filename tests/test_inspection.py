@@ -58,10 +58,10 @@ def scores():
     recording = jaxcal.simulate_recording(jaxcal.Protocol(images=40), 0)
     assert recording.truth is not None
     base = replace(jaxcal.Problem.from_recording(recording), covariance=None)
-    x = jnp.asarray(recording.truth.image_to_probe)
-    truth = Parameters.of(x[:3, :3], x[:3, 3], jnp.asarray(recording.truth.point))
-    q = target_in_image(truth, base)
-    elevational = jnp.einsum("nij,j->ni", base.poses[:, :3, :3], x[:3, 1])
+    x, point = recording.truth.image_to_probe, recording.truth.point
+    truth = Parameters.of(*map(jnp.asarray, (x[:3, :3], x[:3, 3], point)))
+    q = np.asarray(jax.jit(target_in_image)(truth, base))
+    elevational = np.asarray(base.poses)[:, :3, :3] @ x[:3, 1]
 
     def drawn(errors):
         errors = errors * SIGMA

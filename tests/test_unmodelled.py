@@ -108,8 +108,8 @@ def two_echoes() -> Recording:
     return with_points(recording, points)
 
 
-# Images in use, and seeds.
-CLEAN, SEEDS = (12, 30), range(100, 160)
+# Images in use, and seeds: with the faults 127 problems, two chunks of 64.
+CLEAN, SEEDS = (12, 30), range(100, 147)
 
 
 @pytest.fixture(scope="module")
@@ -180,7 +180,7 @@ def test_hardly_anything_is_found_in_clean_recordings(answers, images):
     """Of 4 or 5 tests that chance passes once in a thousand times each."""
     results = [result for _, result in answers[f"clean {images}"]]
     assert [result.images_used for result in results] == [images] * len(SEEDS)
-    assert sum(bool(unmodelled(result)) for result in results) <= 2
+    assert sum(bool(unmodelled(result)) for result in results) <= 1
 
 
 def test_fits_with_the_errors_of_a_tracker_are_looked_at_too(answers):

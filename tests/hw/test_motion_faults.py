@@ -477,7 +477,7 @@ def test_a_caller_that_was_stopped_itself_blames_nobody(monkeypatch):
 
 def test_a_process_that_does_not_read_a_long_setup_does_not_hold_up_the_start(monkeypatch) -> None:
     monkeypatch.setattr("hw.robot.motion._START_PATIENCE_S", 1.0)
-    plan = replace(PLAN, targets=np.repeat(HOME[None], 2000, axis=0))
+    plan = replace(PLAN, targets=np.repeat(HOME[None], 400, axis=0))
     motion = Motion("127.0.0.1", plan, None)
     errors: list[BaseException] = []
 

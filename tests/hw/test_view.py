@@ -6,7 +6,7 @@ import os
 import signal
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from http.client import HTTPConnection
 from pathlib import Path
@@ -22,7 +22,6 @@ from browser import addresses, browsing, pixels
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from hw.bench.run import Bench
 from hw.midplane.bracket import Bracket, Placement
 from hw.planning.poses import Extent, plan_poses
 from hw.recording.layout import RecordingHeader
@@ -43,11 +42,11 @@ from hw.view.page import ellipsoid, to_scale
 PLACEMENT = Placement(Bracket(0.1, -0.7, 0.9, 0.3), 0.1, 3, np.zeros((0, 3)))
 
 
-def wait_until(condition, timeout_s: float = 180.0) -> None:
+def wait_until(condition, timeout_s: float = 180.0, every_s: float = 0.02) -> None:
     deadline = time.monotonic() + timeout_s
     while not condition():
         assert time.monotonic() < deadline, "it did not happen in time"
-        time.sleep(0.02)
+        time.sleep(every_s)
 
 
 def listeners(port: int) -> set[str]:
@@ -65,14 +64,6 @@ def listeners(port: int) -> set[str]:
 
 def port_of(view: LiveView) -> int:
     return int(view.url.rsplit(":", 1)[1])
-
-
-@pytest.fixture(scope="module")
-def bench() -> Iterator[Bench]:
-    pytest.importorskip("serial", reason="needs jaxcal[serial]")
-    pytest.importorskip("rtde_receive", reason="needs jaxcal[robot]")
-    with start(3, 5.0) as bench:
-        yield bench
 
 
 @pytest.fixture(scope="module")
@@ -108,6 +99,54 @@ def travel(session: Session, plan: MotionPlan, pose: np.ndarray) -> PoseSample:
             ) as motion:  # fmt: skip
                 return motion.move_to(pose)
     raise AssertionError("the bench cannot keep up with itself")
+
+
+def test_a_browser_sees_the_bench_move_and_killing_the_view_changes_nothing(tmp_path):
+    pytest.importorskip("serial", reason="needs jaxcal[serial]")
+    pytest.importorskip("rtde_receive", reason="needs jaxcal[robot]")
+    # Near one another, and far enough from where the arm waits to be seen to move.
+    near = Extent(cone_deg=5.0, turn_deg=5.0, lateral_mm=5.0, depth_mm=(20.0, 25.0))
+    said = []
+    with (
+        browsing(tmp_path / "profile") as browser,
+        LiveView(said.append, port=8194) as view,
+        ExitStack() as after_loading,
+    ):
+        browser.get(view.url)
+        addresses(browser)  # those of the browser's own first page
+        browser.refresh()
+
+        def shows(words: str) -> bool:
+            # In one step: a page that is being loaded may have no body yet, or soon another one.
+            script = "return document.body ? document.body.innerText : ''"
+            return words in browser.execute_script(script)
+
+        # At five times its speed the bench takes a core, which the browser needs until here.
+        wait_until(lambda: shows("Waiting for the plan"), every_s=0.1)
+        bench = after_loading.enter_context(start(3, 5.0))
+        setup = replace(setup_of(bench), extent=near)
+        session = after_loading.enter_context(a_session(setup, tmp_path))
+        after_loading.enter_context(watched(view, session))
+        plan = a_plan(setup, session.poses.identity().name)
+        view.plan(setup, plan, plan.targets, [])
+        wait_until(lambda: shows("0 of 5 images"), every_s=0.1)
+        wait_until(lambda: shows("B-mode, newest frame"), every_s=0.1)
+        before = pixels(browser)
+        view.going(0)
+        travel(session, plan, plan.targets[0])
+        view.taken(0, PLACEMENT, None)
+        wait_until(lambda: shows("1 of 5 images"), every_s=0.1)
+        after = pixels(browser)
+        # The scene's part of the page: arm, image plane and poses have moved.
+        scene = slice(0, int(0.6 * before.shape[1]))
+        moved = np.abs(after[:, scene].astype(int) - before[:, scene]).max(axis=2) > 40
+        assert moved.mean() > 0.01
+        assert addresses(browser) <= {"127.0.0.1"}
+        os.kill(view.pid, signal.SIGKILL)
+        wait_until(lambda: len(said) > 1)
+        tracked = travel(session, plan, plan.targets[1])
+        assert np.allclose(tracked.pose[:3, 3], plan.targets[1][:3, 3], atol=0.5)
+        session.wait_until_clear()
 
 
 def test_the_page_is_on_loopback_only(shared_view):
@@ -214,47 +253,6 @@ def test_the_extra_is_named_where_viser_is_missing():
     text = missing("viser_that_is_not_there", extra="view")
     assert text is not None
     assert 'pip install "jaxcal[view]"' in text
-
-
-def test_a_browser_sees_the_bench_move_and_killing_the_view_changes_nothing(bench, tmp_path):
-    # Near one another, and far enough from where the arm waits to be seen to move.
-    near = Extent(cone_deg=5.0, turn_deg=5.0, lateral_mm=5.0, depth_mm=(20.0, 25.0))
-    setup = replace(setup_of(bench), extent=near)
-    said = []
-    with (
-        LiveView(said.append, port=8194) as view,
-        a_session(setup, tmp_path) as session,
-        watched(view, session),
-        browsing(tmp_path / "profile") as browser,
-    ):
-        plan = a_plan(setup, session.poses.identity().name)
-        view.plan(setup, plan, plan.targets, [])
-        browser.get(view.url)
-        addresses(browser)  # those of the browser's own first page
-        browser.refresh()
-
-        def text() -> str:
-            # In one step: a page that is being loaded may have no body yet, or soon another one.
-            return browser.execute_script("return document.body ? document.body.innerText : ''")
-
-        wait_until(lambda: "0 of 5 images" in text())
-        wait_until(lambda: "B-mode, newest frame" in text())
-        before = pixels(browser)
-        view.going(0)
-        travel(session, plan, plan.targets[0])
-        view.taken(0, PLACEMENT, None)
-        wait_until(lambda: "1 of 5 images" in text())
-        after = pixels(browser)
-        # The scene's part of the page: arm, image plane and poses have moved.
-        scene = slice(0, int(0.6 * before.shape[1]))
-        moved = np.abs(after[:, scene].astype(int) - before[:, scene]).max(axis=2) > 40
-        assert moved.mean() > 0.01
-        assert addresses(browser) <= {"127.0.0.1"}
-        os.kill(view.pid, signal.SIGKILL)
-        wait_until(lambda: len(said) > 1)
-        tracked = travel(session, plan, plan.targets[1])
-        assert np.allclose(tracked.pose[:3, 3], plan.targets[1][:3, 3], atol=0.5)
-        session.wait_until_clear()
 
 
 def test_geometry_of_the_page():
