@@ -107,6 +107,18 @@ def test_sound_speed_is_the_engines():
     assert found.sound_speed_prior_m_s is None
 
 
+def test_the_sound_speed_of_pixels_counts_from_that_of_scanners():
+    """A scanner shows depths for 1540 m/s; the target is in water of 1482 m/s."""
+    drawn = of_18(3, elevation_mm=0.0, noise_mm=1e-4)
+    stretched = np.asarray(drawn.measurements) * [1.0, 1540 / 1482] / 0.2
+    pixels = jaxcal.Problem.from_arrays(
+        np.asarray(drawn.poses), stretched, kind="pixel", spacing_mm=(0.2, 0.2)
+    )
+    found = jaxcal.calibrate(pixels, METHOD, estimate=("sound-speed",))
+    assert found.sound_speed_m_s == pytest.approx(1482.0, abs=0.1)
+    assert found.image_transform().range_factor == pytest.approx(1482 / 1540, rel=1e-4)
+
+
 def closed_form(one: jaxcal.Problem, **asked):
     one, plan, _ = prepare(one, Request(method=METHOD, **asked))
     return closed_form_answer(one, plan)

@@ -121,13 +121,15 @@ def test_a_wrong_spacing_is_told_with_the_right_one(slips):
 
 
 def test_pixels_that_no_image_has_are_told(slips):
-    """Poses in mm that were said to be in m ended with an error about depths."""
+    """Poses in mm that were said to be in m, and in inches, which magnetic trackers send."""
     right = slips.recorded(2, "px, unknown")
-    poses = right.poses.copy()
-    poses[:, :3, 3] *= 1000
-    said = wrong_frames(Problem.from_recording(replace(right, poses=poses).images()))
-    assert said is not None
-    assert re.match(r"the pixels come out as 1\d\d x 1\d\d mm: are the poses", said)
+    sizes = ((1000, r"1\d\d x 1\d\d"), (1 / 25.4, r"0\.003\d+ x 0\.004\d+"))
+    for factor, size in sizes:
+        poses = right.poses.copy()
+        poses[:, :3, 3] *= factor
+        said = wrong_frames(Problem.from_recording(replace(right, poses=poses).images()))
+        assert said is not None
+        assert re.match(rf"the pixels come out as {size} mm: are the poses", said)
 
 
 def test_the_verdict_is_do_not_use_and_the_exit_status_says_so(slips):

@@ -47,6 +47,38 @@ def test_a_known_tip():
     assert error @ np.linalg.solve(noisy.covariance, error) < 22.5
 
 
+def slid(seed: int) -> np.ndarray:
+    """A stylus that is turned at 30 poses a second, and slides in the dimple within a second."""
+    rng, wander = np.random.default_rng(seed), np.zeros((300, 3))
+    time = np.arange(300)[:, None] / 30
+    waves = np.sin(2 * np.pi * time * [0.23, 0.31, 0.17] + rng.uniform(0, 6, 3))
+    for index in range(1, 300):
+        wander[index] = 0.97 * wander[index - 1] + 0.05 * rng.normal(size=3)
+    poses = swung(Rotation.from_rotvec(0.5 * waves), noise=0.05, seed=seed)
+    poses[:, :3, 3] += wander
+    return poses
+
+
+def test_errors_that_successive_poses_share_widen_the_covariance():
+    squares = 0.0
+    for seed in range(6):
+        found = jaxcal.calibrate_pivot(slid(seed))
+        assert float(found.alike_for) > 10
+        error = found.tip - TIP
+        squares += float(error @ np.linalg.solve(found.covariance[:3, :3], error))
+    # A chi-square with 18 degrees of freedom is below 42.3 in 999 of 1000.
+    assert squares < 42.3
+    found = jaxcal.calibrate_pivot(slid(0))
+    told = f"errors are alike for about {float(found.alike_for):.0f} successive poses"
+    assert told in str(found)
+    both = np.asarray(found.information @ found.covariance)
+    np.testing.assert_allclose(both, float(found.sigma) ** 2 * np.eye(6), atol=1e-8)
+    shuffled = jaxcal.calibrate_pivot(slid(0)[np.random.default_rng(0).permutation(300)])
+    assert float(shuffled.alike_for) == 1.0
+    assert "alike" not in str(shuffled)
+    np.testing.assert_allclose(found.covariance, shuffled.covariance * found.alike_for, rtol=1e-6)
+
+
 def test_rotation_about_one_axis_leaves_the_tip_open_along_it():
     axis = np.array([0.0, 0.6, 0.8])
     one = Rotation.from_rotvec(np.linspace(-0.5, 0.5, 300)[:, None] * axis)
@@ -195,7 +227,11 @@ def test_real_recording_with_outliers_reaches_the_clean_ones_precision(real_data
     # The last 144 of its 480 poses are wrong.
     assert record["outliers"] == list(range(336, 480))
     assert record["rms_mm"] == pytest.approx(float(clean.rms), rel=0.05)
-    assert np.linalg.norm(np.array(record["tip_mm"]) - np.asarray(clean.tip)) < 0.4
+    apart = np.array(record["tip_mm"]) - np.asarray(clean.tip)
+    assert np.linalg.norm(apart) < 0.4
+    both = np.array(record["covariance"])[:3, :3] + np.asarray(clean.covariance)[:3, :3]
+    # A chi-square with 3 degrees of freedom is below 7.81 in 95 of 100.
+    assert apart @ np.linalg.solve(both, apart) < 7.81
     plain = jaxcal.calibrate_pivot(
         read_poses(folder / "pivotCalibrationDataWithOutliers.txt"), robust=False
     )

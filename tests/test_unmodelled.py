@@ -175,6 +175,19 @@ def test_a_few_neighbours_with_one_error_are_no_distortion(answers):
     assert all("distortion" not in {each.kind for each in unmodelled(one)} for one in results)
 
 
+@pytest.mark.parametrize("kind", ["distortion", "slip", "step"])
+def test_conventional_fits_are_looked_at_too(kind):
+    found = []
+    for seed in range(4):
+        recording = FAULTS[kind](clean(seed))
+        tre = jaxcal.calibrate(recording, "conventional").record()["tre"]
+        found.append(tre["unmodelled"] is not None and tre["unmodelled"]["kind"] == kind)
+        assert not found[-1] or any(WORDS[kind] in words for words in tre["contradictions"])
+        right = jaxcal.calibrate(clean(seed), "conventional").record()["tre"]
+        assert right["unmodelled"] is None
+    assert sum(found) >= 3
+
+
 @pytest.mark.parametrize("images", CLEAN)
 def test_hardly_anything_is_found_in_clean_recordings(answers, images):
     """Of 4 or 5 tests that chance passes once in a thousand times each."""

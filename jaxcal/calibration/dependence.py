@@ -396,15 +396,7 @@ def _stride(problem: Problem, estimate: tuple[str, ...]) -> int:
     errors = _conventional_errors(problem, estimate)
     if errors is None:
         return 1
-    time = 1.0
-    cut = clipped(errors)
-    for values in cut.T:
-        # Errors much smaller than the others do not count, however slowly they change.
-        if np.var(values) < NEGLIGIBLE_SHARE * np.sum(np.var(cut, axis=0)):
-            continue
-        correlation = autocorrelation(values)
-        if correlation[1] * np.sqrt(len(values)) > STREAM_SCORE:
-            time = max(time, correlation_time(correlation))
+    time = alike_for(errors)
     if time < LEAST_STREAM_TIME or wrong_frames(problem, estimate):
         # Errors of wrong poses are alike for as long as the motion lasts, but no image has them:
         # of the few that were kept, a fit would show nothing.
@@ -417,6 +409,23 @@ def _moves_continuously(poses: Float[np.ndarray, "n 4 4"]) -> bool:
     steps = displacement(poses[1:], poses[:-1])
     apart = displacement(poses, np.roll(poses, len(poses) // 2, axis=0))
     return bool(np.median(steps) < CONTINUOUS_SHARE * np.median(apart))
+
+
+def alike_for(errors: Float[np.ndarray, "n k"]) -> float:
+    """The longest correlation time of the kinds of errors; 1 if chance explains the correlation.
+
+    Args:
+        errors: in the order in which they were made, mm.
+    """
+    time, cut = 1.0, clipped(errors)
+    for values in cut.T:
+        # Errors much smaller than the others do not count, however slowly they change.
+        if np.var(values) < NEGLIGIBLE_SHARE * np.sum(np.var(cut, axis=0)):
+            continue
+        correlation = autocorrelation(values)
+        if correlation[1] * np.sqrt(len(values)) > STREAM_SCORE:
+            time = max(time, correlation_time(correlation))
+    return time
 
 
 def clipped(errors: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:

@@ -6,6 +6,10 @@ X's rotation is held fixed: the free blocks are X's translation and the point. S
 covariance and observability are the same as for image calibration.
 
 The errors of the three axes share one SD, so this is plain least squares on the images that agree.
+
+A tracker delivers tens of poses a second, and the tip slides in its dimple more slowly. So errors
+are alike for t successive poses (:func:`jaxcal.calibration.dependence.alike_for`), and n poses are
+worth n / t independent ones: the covariance is t times as large.
 """
 
 from __future__ import annotations
@@ -21,6 +25,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxcal import InputError
 from jaxcal.calibration.answer import inverse_and_observability
+from jaxcal.calibration.dependence import alike_for
 from jaxcal.data.poses import check_poses
 from jaxcal.data.problem import Problem
 from jaxcal.data.recording import LEAST_REACH_MM, MINIMUM_IMAGES, MetresError
@@ -63,7 +68,10 @@ class Pivot(eqx.Module):
         outlier: 1 where a pose does not fit the rest; a robust solve leaves it out.
         studentised_errors: errors of all poses, in robust SDs of the used poses' errors.
         status_code: a :class:`jaxcal.Status`.
-        information: of (tip, point) for errors with an SD of 1 mm.
+        information: of (tip, point) for errors with an SD of 1 mm, each of which counts once.
+        alike_for: errors are alike for so many successive poses, of which covariance and
+            information count one; 1 for batches and under transformations, where it is not looked
+            for.
         robust: poses that do not fit the rest were left out (static).
     """
 
@@ -78,6 +86,7 @@ class Pivot(eqx.Module):
     studentised_errors: Float[Array, "*batch n 3"]
     status_code: Int[Array, "*batch"]
     information: Float[Array, "*batch 6 6"]
+    alike_for: Float[Array, "*batch"]
     robust: bool = eqx.field(static=True, default=True)
 
     @property
@@ -189,7 +198,8 @@ def calibrate_pivot(
     """Find a tool's tip and the point about which it turned.
 
     Args:
-        poses: tool -> tracker, mm, (n, 4, 4) or (n, 3, 4); concrete ones are checked and their
+        poses: tool -> tracker, mm, (n, 4, 4) or (n, 3, 4), in the order in which they were taken;
+            concrete ones are checked and their
             rotations projected to SO(3). Leading axes make a batch, which is solved as it is.
         mask: True (or 1) for poses to use; all by default. Of concrete poses, not of a batch, those
             that repeat an earlier one exactly are not used.
@@ -239,8 +249,20 @@ def calibrate_pivot(
     platform = None if inside_transformation(array, weight) else jax.default_backend()
     if platform == "cpu" and array.ndim == 3:
         found = _solve_kept(np.asarray(array), np.asarray(weight), robust)
-        return jax.device_put(found, next(iter(array.devices())) if array.committed else None)
-    return compiler.compiled(_solve_all, 2, platform)(array, weight, robust)
+        found = jax.device_put(found, next(iter(array.devices())) if array.committed else None)
+    else:
+        found = compiler.compiled(_solve_all, 2, platform)(array, weight, robust)
+    return found if platform is None or array.ndim > 3 else _widened(found)
+
+
+def _widened(found: Pivot) -> Pivot:
+    """One concrete calibration whose covariance counts errors that poses share once."""
+    used = np.asarray(found.mask) > 0
+    time = alike_for(np.asarray(found.residual)[used]) if found.status == "converged" else 1.0
+    if time == 1.0:
+        return found
+    changed = (found.covariance * time, found.information / time, found.alike_for * time)
+    return eqx.tree_at(lambda p: (p.covariance, p.information, p.alike_for), found, changed)
 
 
 def _first_of_each(
@@ -327,6 +349,7 @@ def _solve(poses: Float[Array, "n 4 4"], mask: Float[Array, " n"], *, robust: bo
         studentised_errors=studentised,
         status_code=jnp.where(failed, Status.FAILED, status).astype(jnp.int32),
         information=information,
+        alike_for=jnp.ones_like(variance),
         robust=robust,
     )
 

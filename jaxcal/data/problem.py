@@ -27,7 +27,7 @@ from jaxcal.data.recording import (
     images_of,
     make_images,
 )
-from jaxcal.data.sound import WATER_M_S, check_sound_speed
+from jaxcal.data.sound import SCANNER_M_S, WATER_M_S, check_sound_speed
 from jaxcal.runtime.array_types import AnyArray, Float, HeldArray
 from jaxcal.runtime.arrays import (
     array_module,
@@ -149,10 +149,10 @@ class Problem:
 
     @property
     def nominal_sound_speed(self) -> Float[HeldArray, "*batch"]:
-        """The speed by which times of flight became distances, m/s; water's where unknown."""
+        """The speed by which times became ranges, m/s; a scanner's or water's where unknown."""
         if self.sound_speed is None:
-            xp = array_module(self.mask)
-            return xp.full(self.batch_shape, WATER_M_S, self.mask.dtype)
+            xp, assumed = array_module(self.mask), SCANNER_M_S if self.pixels else WATER_M_S
+            return xp.full(self.batch_shape, assumed, self.mask.dtype)
         return self.sound_speed
 
     def cleared(self, used: Float[AnyArray, "*batch n"]) -> Problem:

@@ -15,6 +15,9 @@ _MARCZAK = (1.402385e3, 5.038813, -5.799136e-2, 3.287156e-4, -1.398845e-6, 2.787
 WATER_M_S = 1490.0
 """Speed of sound in water at room temperature, assumed where none is given."""
 
+SCANNER_M_S = 1540.0
+"""Speed of sound by which ultrasound scanners compute the depth of a pixel: the mean of tissues."""
+
 SLOWEST_M_S, FASTEST_M_S = 100.0, 10_000.0
 
 

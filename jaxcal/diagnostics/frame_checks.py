@@ -55,8 +55,8 @@ UNKNOWNS = 11
 MOST_IMAGES = 150
 """Longer recordings are checked on so many images, evenly spread."""
 
-PIXELS_MM = (0.002, 3.0)
-"""Smallest and largest credible size of a pixel."""
+PIXELS_MM = (0.008, 3.0)
+"""Smallest and largest credible size of a pixel: with poses in inches, 0.2 mm become 0.0079."""
 
 SAME_SCALE = 1.25
 """With a slip corrected, known scales must come out within this factor."""
@@ -124,7 +124,7 @@ def wrong_frames(problem: Problem, estimate: tuple[str, ...] = ()) -> str | None
             "clock, and in which frames and conventions are the poses?"
         )
     size = fit.scales * given.spacing
-    if not known and size.max() > PIXELS_MM[1]:
+    if not known and not PIXELS_MM[0] <= size.max() <= PIXELS_MM[1]:
         return (
             f"the pixels come out as {size[0]:.3g} x {size[1]:.3g} mm: are the poses' translations "
             "in mm?"

@@ -48,6 +48,8 @@ Array = np.ndarray
 
 FEWEST = 12
 """With fewer images in use nothing is looked for."""
+_FEWEST_CONVENTIONAL = 15
+"""The same for conventional fits: of 300 clean ones of 12 images, 9 would be reported."""
 
 _FREEDOM = {"scale": 2, "slip": 3, "step": 3, "skew": 1, "curve": 1, "beside": 1}
 """Number of parameters of each error."""
@@ -127,17 +129,19 @@ class Unmodelled:
 def unmodelled(calibration: Calibration) -> list[Unmodelled]:
     """What the residuals of one calibration with concrete values show, the clearest first.
 
-    Only fits of points with offsets are looked at.
+    Only fits of points are looked at.
     """
     used = np.asarray(calibration.mask) > 0
-    fits = calibration.method != "conventional" and calibration.data == "points"
-    if calibration.problem is None or not fits or used.sum() < FEWEST:
+    fewest = _FEWEST_CONVENTIONAL if calibration.method == "conventional" else FEWEST
+    points = calibration.data == "points"
+    if calibration.problem is None or not points or used.sum() < fewest:
         return []
     answer = map_arrays(lambda leaf: np.asarray(leaf)[None], calibration.numpy())
     if calibration.prior in TUNED:
         seen = ImageErrors.of_answer(answer).centred(answer)
     else:
-        # Offsets that are free within a bound absorb much of an error, above all a step.
+        # Offsets that are free within a bound absorb much of an error, above all a step; and
+        # the conventional fit, which has none, weighs them like the other errors.
         seen = GaussianOffsets.of(answer).seen
     columns = _columns(seen, used)
     rows = np.concatenate([seen.rows[0], *(each for _, _, each in columns)], axis=-1)[None]

@@ -24,6 +24,7 @@ def pivot_record(result: Pivot) -> dict[str, Any]:
             "tip_mm": np.asarray(result.tip),
             "point_mm": np.asarray(result.point),
             "covariance": covariance if np.isfinite(covariance).all() else None,
+            "alike_for_poses": float(result.alike_for),
             "sigma_mm": float(result.sigma),
             "rms_mm": float(result.rms),
             "robust": result.robust,
@@ -53,6 +54,12 @@ def pivot_lines(record: dict[str, Any]) -> list[str]:
     if record["covariance"] is not None:
         spread = [record["covariance"][axis][axis] ** 0.5 for axis in range(3)]
         lines.append("SD of the tip (mm): " + ", ".join(f"{value:.3f}" for value in spread))
+    if record["alike_for_poses"] > 1:
+        alike, used = record["alike_for_poses"], record["poses_used"]
+        lines.append(
+            f"errors are alike for about {alike:.0f} successive poses: for the SD, {used} poses "
+            f"count as {max(used / alike, 1):.0f}"
+        )
     if record["repeated"]:
         again = counted(record["repeated"], "pose", "repeats", "repeat")
         lines.append(f"{again} an earlier one exactly: not used")
