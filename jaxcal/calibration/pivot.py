@@ -199,8 +199,8 @@ def calibrate_pivot(
 
     Args:
         poses: tool -> tracker, mm, (n, 4, 4) or (n, 3, 4), in the order in which they were taken;
-            concrete ones are checked and their
-            rotations projected to SO(3). Leading axes make a batch, which is solved as it is.
+            concrete ones are checked and their rotations projected to SO(3). Leading axes make a
+            batch, which is solved as it is.
         mask: True (or 1) for poses to use; all by default. Of concrete poses, not of a batch, those
             that repeat an earlier one exactly are not used.
         robust: find the poses that agree with each other, even if nearly half of all poses are
