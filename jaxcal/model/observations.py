@@ -51,7 +51,7 @@ from jaxcal.model.unknowns import (
     stepped,
     with_prior,
 )
-from jaxcal.model.unrolled import Matrix, Vector, add
+from jaxcal.model.unrolled import Matrix, Vector, add, inverse_root
 from jaxcal.runtime.array_types import AnyArray
 from jaxcal.runtime.arrays import is_traced
 from jaxcal.runtime.given_values import real_array
@@ -235,7 +235,7 @@ def errors(q: Vector, further: FurtherUnknowns, images: ImagePlanes) -> tuple[Ar
     """Error of lateral position and of range, mm, of every image."""
     lateral, distance = further.points(images)
     square = q[1] * q[1] + q[2] * q[2]
-    return q[0] - lateral, square * jax.lax.rsqrt(square) - distance
+    return q[0] - lateral, square * inverse_root(square) - distance
 
 
 def factor_of(shape: Float[Array, "3 batch n"]) -> tuple[Array, Array, Array]:
@@ -516,7 +516,7 @@ class BoundedOffsets(LocalUnknown):
         """
         limit, distance = self.limit(further, images), further.points(images)[1]
         square = q[1] * q[1] + q[2] * q[2]
-        closest = distance * q[1] * jax.lax.rsqrt(square)
+        closest = distance * q[1] * inverse_root(square)
         # Behind the transducer the arc's nearer end is the one on q's side.
         behind = jnp.where(q[1] < 0, -limit, limit)
         free = jnp.where(q[2] > 0, closest, behind)

@@ -11,10 +11,10 @@ type VII with e = 5/2 is Student's t with four degrees of freedom.
 Inference needs only one function of a shape, :func:`tilted`: mass, mean and variance of the shape
 times a Gaussian, cut to an interval. It is one quadrature over the interval where both factors are
 not negligible, on equidistant nodes, with Gregory's corrections where the product may end abruptly.
-On such nodes the Gaussian needs only three exponentials: two products give its value from that at
-the node before, and two sums give 1 -+ (u/a)^2. This is the inner loop of the whole estimator, so
-it is written for XLA to make a single vectorised loop of it: one reduction over the interval's two
-halves, each summed from its end towards the middle, with so few nodes that the compiler unrolls
+On such nodes the Gaussian needs only three exponentials: its two values next to the middle, and two
+products lead from each node to the next one outwards. Two sums do the same for 1 -+ (u/a)^2. This
+is the inner loop of the whole estimator, so it is written for XLA to make a single vectorised loop
+of it: one reduction over the interval's two halves, with so few nodes that the compiler unrolls
 them.
 
 Reference for the corrections: Hildebrand, Introduction to Numerical Analysis, 5.9.
@@ -31,8 +31,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxcal.model import unrolled
+from jaxcal.model.batch import barrier
 from jaxcal.model.distributions import Family
-from jaxcal.model.unrolled import Entry
+from jaxcal.model.unrolled import Entry, inverse_root
 from jaxcal.runtime.jax_modes import in_standard_promotion
 
 NODES = 8
@@ -42,7 +43,7 @@ REACH = 4.5
 """The Gaussian factor is taken to end this many SDs from its mean."""
 
 END_WEIGHTS = np.array([475.0, 1902.0, 1104.0, 1586.0, 1413.0]) / 1440.0
-"""Gregory's weights of the first and the last nodes; nodes between have weight one."""
+"""Gregory's weights of the first and, in reverse, of the last nodes; those between have one."""
 
 EDGE: dict[Family, float] = {"uniform": 3**0.5, "bell": 7**0.5, "gaussian": 1e3, "student": 1e3}
 """Where each family's density of unit SD ends; the last two have no end that matters."""
@@ -62,7 +63,7 @@ def profile(family: Family, base: Array) -> Array:
     """Density over its height, from 1 -+ (u/a)^2."""
     if family == "bell":
         return base * base
-    inverse = jax.lax.rsqrt(base)
+    inverse = inverse_root(base)
     square = inverse * inverse
     return inverse * (square * square)
 
@@ -110,7 +111,7 @@ def tilted(
         # A Gaussian times a Gaussian is a Gaussian; if it is cut, it is a flat shape times one.
         both = variance + sd**2
         log_factor = -0.5 * mean**2 / both
-        height = jax.lax.rsqrt(2 * np.pi * both)
+        height = inverse_root(2 * np.pi * both)
         mean, variance = mean * sd**2 / both, variance * sd**2 / both
         if interval is None:
             return Moments(height, log_factor, mean, variance)
@@ -151,40 +152,42 @@ def _sums(family: Family, abrupt: bool, window: Window) -> tuple[Array, Array, A
     x is a node's place about the middle, in steps. The ends have weights only if they are abrupt.
     """
     middle, step, nearest, out, precision, scale = window
-    ndim = step.ndim
-    sign = jnp.asarray([1.0, -1.0], step.dtype).reshape(2, *(1,) * ndim)
-    pace = sign * step
-    begin = middle - (NODES - 0.5) * pace
+    sign = jnp.asarray([1.0, -1.0], step.dtype).reshape(2, *(1,) * step.ndim)
+    upper = sign > 0
     # Relative to its value at ``nearest`` the Gaussian is exp((out - t / 2) t / w), t = u -
     # nearest; from node to node the exponent changes linearly.
-    first = begin - nearest
-    value = jnp.exp((out - 0.5 * first) * first * precision)
-    ratio = jnp.exp(pace * (out - first - 0.5 * pace) * precision)
+    at = middle - nearest
+    first = at + 0.5 * step
+    above = jnp.exp((out - 0.5 * first) * first * precision)
+    slope = jnp.exp((out - at) * step * precision)
     bend = jnp.exp(-step * step * precision)
-    start, stride = begin * scale, pace * scale
+    # Both halves use these, and exponentials would be most of the loop.
+    above, slope, bend = barrier((above, slope, bend))
+    inverse = 1 / slope
+    value = jnp.where(upper, above, above * inverse)
+    ratio = jnp.where(upper, slope, inverse) * bend
+    stride = sign * step * scale
+    start = middle * scale + 0.5 * stride
     curvature = CURVATURE[family]
     base = 1 + curvature * start * start
     change = curvature * stride * (2 * start + stride)
     growth = 2 * curvature * stride * stride
-    # Sums of sums: with d = NODES, NODES - 1, ... 1 towards the middle they are the sums of
-    # (1, d, d (d + 1) / 2) times the mass.
+    weight = np.ones(NODES)
+    if abrupt:
+        weight[-len(END_WEIGHTS) :] = END_WEIGHTS[::-1]
     total: Entry = 0
     line: Entry = 0
     parabola: Entry = 0
-    for node in range(NODES):
+    for place, share in zip(np.arange(NODES) + 0.5, weight, strict=True):
         mass = value if family == "uniform" else value * profile(family, base)
-        if abrupt and node < len(END_WEIGHTS):
-            mass = float(END_WEIGHTS[node]) * mass
-        total = unrolled.add(total, mass)
-        line = unrolled.add(line, total)
-        parabola = unrolled.add(parabola, line)
+        total = unrolled.add(total, float(share) * mass)
+        line = unrolled.add(line, float(share * place) * mass)
+        parabola = unrolled.add(parabola, float(share * place**2) * mass)
         value, ratio = value * ratio, ratio * bend
         base, change = base + change, change + growth
-    # |x| = d - 1/2.
-    halves = (total, sign * (0.5 * total - line), 2 * (parabola - line) + 0.25 * total)
     zero = jnp.zeros((), step.dtype)
     return jax.lax.reduce(
-        halves,
+        (total, sign * line, parabola),
         (zero, zero, zero),
         lambda a, b: tuple(x + y for x, y in zip(a, b, strict=True)),
         (0,),
