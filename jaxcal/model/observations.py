@@ -51,7 +51,7 @@ from jaxcal.model.unknowns import (
     stepped,
     with_prior,
 )
-from jaxcal.model.unrolled import Matrix, Vector, add, inverse_root
+from jaxcal.model.unrolled import Matrix, Vector, add, inverse_root, root
 from jaxcal.runtime.array_types import AnyArray
 from jaxcal.runtime.arrays import is_traced
 from jaxcal.runtime.given_values import real_array
@@ -235,7 +235,7 @@ def errors(q: Vector, further: FurtherUnknowns, images: ImagePlanes) -> tuple[Ar
     """Error of lateral position and of range, mm, of every image."""
     lateral, distance = further.points(images)
     square = q[1] * q[1] + q[2] * q[2]
-    return q[0] - lateral, square * inverse_root(square) - distance
+    return q[0] - lateral, root(square) - distance
 
 
 def factor_of(shape: Float[Array, "3 batch n"]) -> tuple[Array, Array, Array]:
@@ -368,7 +368,7 @@ class ChannelDistances(Observation):
         square = 0.0
         for value, element in zip(q, channels.elements, strict=True):
             square = square + (value[..., None] - element[:, None, :]) ** 2
-        exact = further.predicted_distance(jnp.sqrt(square))
+        exact = further.predicted_distance(root(square))
         return [Component([exact - channels.distances], channels.heard), Component([q[1]])]
 
     def count(self, images: ImagePlanes) -> Float[Array, "2 batch"]:
@@ -384,7 +384,7 @@ def _unit(images: ImagePlanes) -> Float[Array, "1 batch"]:
 def on_circle(q: Vector, y: Array, further: FurtherUnknowns, images: ImagePlanes) -> Vector:
     """Q - p(y), mm: the residuals of Eq. 7 at a given offset."""
     lateral, distance = further.points(images)
-    return [q[0] - lateral, q[1] - y, q[2] - jnp.sqrt(distance * distance - y * y)]
+    return [q[0] - lateral, q[1] - y, q[2] - root(distance * distance - y * y)]
 
 
 class InPlane(Observation):

@@ -109,6 +109,17 @@ def _inverse_root_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Ar
     return root, -0.5 * root * (root * root) * tangents[0]
 
 
+@jax.custom_jvp
+def root(value: Array) -> Array:
+    """Square root of a positive number; it and its derivatives vectorise (:func:`inverse_root`)."""
+    return value * inverse_root(value)
+
+
+@root.defjvp
+def _root_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    return root(*primals), 0.5 * inverse_root(*primals) * tangents[0]
+
+
 def cholesky(matrix: Matrix) -> tuple[Matrix, Vector]:
     """Lower factor (strictly below the diagonal) and the inverses of its diagonal."""
     size = len(matrix)
