@@ -439,6 +439,14 @@ def test_elements_in_another_order_are_named():
     assert not noisy.warnings
 
 
+def test_a_pitch_in_another_unit_is_named():
+    """It was "covariance 0 holds a number beyond 1e+07"."""
+    _, distances = draw(L14_5, 12, 0.2)
+    recording = Recording(raw(distances, L14_5), probe=replace(L14_5, pitch_mm=0.0457))
+    with pytest.raises(InputError, match=r"of 12 frames .* probe's pitch"):
+        segment(recording)
+
+
 def test_too_few_frames_are_an_error_of_the_recording():
     _, distances = draw(L14_5, 6, 0.5)
     distances[3:] = np.nan

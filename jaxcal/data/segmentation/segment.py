@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float, Int
 from jaxcal import InputError
 from jaxcal.data.probe import MOST_ELEMENTS, CurvilinearProbe, Probe, check_probe
 from jaxcal.data.recording import (
+    LARGEST,
     MINIMUM_IMAGES,
     Images,
     Recording,
@@ -195,7 +196,8 @@ def segment(
         failed |= used & (2 * rejected > lines)
         if robust:
             accepted &= _near(distances, probe, points if full is None else full[0], noise)
-        good = np.isfinite(covariance).all(axis=(1, 2))
+        with np.errstate(invalid="ignore"):
+            good = (np.abs(covariance) <= LARGEST).all(axis=(1, 2))
         failed |= used & ~good
         if robust and (used & ~failed).any():
             typical = max(float(np.median(noise[used & ~failed])), 1e-3)
@@ -208,7 +210,8 @@ def segment(
     if isinstance(data, Recording) and mask.sum() < MINIMUM_IMAGES:
         raise InputError(
             f"only {int(mask.sum())} of {int(used.sum())} frames of times of flight could be "
-            f"segmented: at least {MINIMUM_IMAGES} are needed"
+            f"segmented: at least {MINIMUM_IMAGES} are needed; if they hold answers, check the "
+            "probe's pitch, sound speed and delay"
         )
     segmented = make_images(
         images.poses,
