@@ -582,6 +582,8 @@ def test_json_that_lies(tmp_path, change, message):
         (np.diag([0.1, -0.1, 0.1, 1]), "is a reflection"),
         (np.diag([0.1, 0, 0.1, 1]), "flat"),
         (np.diag([0.1, 1e-10, 0.1, 1]), "pixels have no size"),
+        (np.diag([1.5e-4, 1.4e-4, 1.5e-4, 1]), "looks like metres"),
+        (np.diag([150.0, 140.0, 150.0, 1]), "give it in mm"),
         (np.diag([0.1, np.nan, 0.1, 1]), "finite"),
         (np.diag([0.1, 0.1, 0.1, 2]), "last row"),
         (np.eye(4) + np.pad([[0.1]], ((0, 3), (1, 2))), "degrees apart: fCal fitted"),
