@@ -388,6 +388,7 @@ def test_frames_without_answers_are_masked_and_counted():
     assert found.missing[4] == 128
     assert found.missing[1] == 0
     assert found.warnings[0] == "2 of 11 frames could not be segmented: 4, 9"
+    assert "accepted=bool[12,128]" in repr(found)
     weak = segment(replace(images, amplitude=np.arange(12.0)), L14_5, minimum_amplitude=3.0)
     np.testing.assert_array_equal(np.flatnonzero(weak.failed), [0, 2, 4, 9])
 

@@ -31,6 +31,7 @@ from jaxcal.io.given_files import naming
 from jaxcal.model.image_points import point_jacobian
 from jaxcal.model.unknowns import TABLE, tangent_names
 from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.arrays import outline
 from jaxcal.runtime.given_values import check_flag, real_array
 from jaxcal.runtime.messages import shown
 
@@ -56,6 +57,8 @@ class AppliedPoints:
 
     points: Float[np.ndarray, "n 3"]
     covariance: Float[np.ndarray, "n 3 3"]
+
+    __repr__ = outline
 
 
 @dataclass(frozen=True, eq=False)

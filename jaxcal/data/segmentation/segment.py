@@ -34,6 +34,7 @@ from jaxcal.data.segmentation.time_of_flight import (
 )
 from jaxcal.runtime import executables
 from jaxcal.runtime.array_types import AnyArray
+from jaxcal.runtime.arrays import outline
 from jaxcal.runtime.compiler import ONE_PROBLEM, batch_flags, fast_to_run
 from jaxcal.runtime.given_values import check_flag, is_number, whole_number
 from jaxcal.runtime.jax_modes import in_own_modes
@@ -88,6 +89,8 @@ class OutOfPlane:
     elevation_sd: Float[np.ndarray, " n"]
     determined: Bool[np.ndarray, " n"]
 
+    __repr__ = outline
+
 
 @dataclass(frozen=True, eq=False)
 class Segmentation:
@@ -118,6 +121,8 @@ class Segmentation:
     noise_mm: Float[np.ndarray, " n"]
     out_of_plane: OutOfPlane | None = None
     warnings: tuple[str, ...] = ()
+
+    __repr__ = outline
 
 
 @in_own_modes
