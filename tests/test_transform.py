@@ -787,6 +787,22 @@ def test_apply_refuses_options_of_poses_where_a_table_has_none(saved, tmp_path, 
     assert main(["apply", str(saved), str(uv), "--skip-invalid"]) == 0
 
 
+def test_apply_refuses_poses_that_look_like_metres(saved, tmp_path, capsys):
+    """Points came out as if the probe had hardly moved, without a word."""
+    table = tmp_path / "p.csv"
+    places = np.random.default_rng(0).uniform(-0.3, 0.3, (5, 3))
+    rows = [f"300,12,{x},{y},{z},0,0,0,1" for x, y, z in places.tolist()]
+    table.write_text("\n".join(["u,v,x,y,z,qx,qy,qz,qw", *rows]))
+    assert main(["apply", str(saved), str(table)]) == 2
+    said = capsys.readouterr().err
+    assert f"{table}: pose translations reach only" in said
+    assert "look like metres; give them in mm (--pose-units m)" in said
+    assert main(["apply", str(saved), str(table), "--pose-units", "m"]) == 0
+    got = np.array([line.split(",")[:3] for line in capsys.readouterr().out.splitlines()[1:]])
+    still = random_transform().apply(np.array([[300.0, 12.0]])).points
+    np.testing.assert_allclose(got.astype(float), still + 1e3 * places, atol=1e-9)
+
+
 def test_served_to_another_client():
     """pyigtl, which is not ours, gets the matrix at once, and again."""
     pyigtl = pytest.importorskip("pyigtl")
