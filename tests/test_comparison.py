@@ -226,7 +226,8 @@ def test_what_two_calibrations_should_share_and_do_not_is_told(files, tmp_path, 
         assert "The two are one and the same calibration" in told(capsys, *names)
     other = str(tmp_path / "other.json")
     frames = {"from": "Port 1", "to": None}
-    changed = record | {"scale_mm_per_px": [0.05, 0.12], "source": "rec.h5", "pose_frames": frames}
+    changed = record | {"scale_mm_per_px": [0.05, 0.12], "plus_image_to_probe": None}
+    changed |= {"source": "rec.h5", "pose_frames": frames}
     Path(other).write_text(json.dumps(changed))
     said = told(capsys, files[1], other)
     assert "A pixel is 0.1000 x 0.1200 mm in the first and 0.0500 x 0.1200 mm in the second" in said

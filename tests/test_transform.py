@@ -566,6 +566,11 @@ def good_record():
         ({"version": True}, "is version 'True'"),
         ({"image_plane_to_probe": np.diag([1, 1, -1, 1]).tolist()}, "is a reflection"),
         ({"scale_mm_per_px": [0, 1]}, "must be positive"),
+        # What was changed in one matrix alone, or is missing, was passed over.
+        ({"plus_image_to_probe": np.diag([0.148, 0.14, 0.1, 1]).tolist()}, "contradicts"),
+        ({"scale_mm_per_px": None}, "plus_image_to_probe contradicts"),
+        ({"face_offset_mm": None}, "plus_image_to_probe contradicts"),
+        ({"plus_image_to_probe": "x"}, "must be numbers"),
         ({"covariance": [[1]]}, r"must have shape \(6, 6\)"),
     ],
 )
