@@ -424,6 +424,18 @@ def test_times_at_the_end_of_the_receivers_window_are_no_answers(probe):
     assert any("the end of the receiver's window" in text for text in found.warnings)
 
 
+def test_a_time_of_zero_is_no_answer_whatever_the_delay():
+    """With a delay of -1 us they counted as echoes 1.5 mm away: ranges were 19 mm short."""
+    probe = replace(L14_5, delay_s=-1e-6)
+    _, distances = draw(probe, 12, 0.2)
+    dead = np.random.default_rng(3).random(128) < 0.4
+    silent = raw(np.where(dead, np.nan, distances), probe)
+    zero = replace(silent, measurements=np.nan_to_num(silent.measurements))
+    found, best = segment(zero, probe), segment(silent, probe)
+    np.testing.assert_array_equal(found.missing, best.missing)
+    np.testing.assert_array_equal(found.images.measurements, best.images.measurements)
+
+
 def test_ties_of_a_slow_clock_are_answers():
     exact = np.hypot(L14_5.element_lateral(), np.linspace(60, 120, 24)[:, None])
     distances = 1.5 * np.round(exact / 1.5)

@@ -139,8 +139,8 @@ def segment(
 ) -> Segmentation:
     """Segment the target in every frame of times of flight.
 
-    No answer is NaN. If more than 8 elements have exactly the longest time of their frame, it is
-    taken for the end of the receiver's window, and they for elements without an answer.
+    No answer is NaN, or 0. If more than 8 elements have exactly the longest time of their frame, it
+    is taken for the end of the receiver's window, and they for elements without an answer.
 
     Points of a curved array come from the in-plane fit, which is what an image would show. The
     array's own estimate of the elevation is so uncertain (y^2 has an SD of hundreds of mm^2 for a
@@ -183,7 +183,8 @@ def segment(
     used = images.mask
     check_times_of_flight(times, probe, used)
     cut = used[:, None] & _end_of_window(times)
-    distances = np.where(used[:, None] & ~cut, probe.one_way_range_mm(times), np.nan)
+    answered = used[:, None] & ~cut & (times > 0)
+    distances = np.where(answered, probe.one_way_range_mm(times), np.nan)
     accepted = np.isfinite(distances) & (distances > 0)
     lines = accepted.sum(axis=1)
 
