@@ -159,6 +159,7 @@ def test_a_verdict_that_expects_larger_errors_is_told(files, capsys):
     replace(known, tre_factor=2.8).save(files[2])
     said = told(capsys, *files[1:])
     assert said.count("expects errors 2.8 times as large as its covariance says") == 1
+    assert f"verdictof{files[2]}expects" in said.replace(" ", "")  # the whole name
     assert "2.8 times" in told(capsys, *files)
     assert "times as large" not in told(capsys, *files[:2])
     main(["compare", *files, *PIXELS, "--json"])
@@ -225,7 +226,8 @@ def test_what_two_calibrations_should_share_and_do_not_is_told(files, tmp_path, 
         assert "The two are one and the same calibration" in told(capsys, *names)
     other = str(tmp_path / "other.json")
     frames = {"from": "Port 1", "to": None}
-    changed = record | {"scale_mm_per_px": [0.05, 0.12], "source": "rec.h5", "pose_frames": frames}
+    changed = record | {"scale_mm_per_px": [0.05, 0.12], "plus_image_to_probe": None}
+    changed |= {"source": "rec.h5", "pose_frames": frames}
     Path(other).write_text(json.dumps(changed))
     said = told(capsys, files[1], other)
     assert "A pixel is 0.1000 x 0.1200 mm in the first and 0.0500 x 0.1200 mm in the second" in said
@@ -235,3 +237,8 @@ def test_what_two_calibrations_should_share_and_do_not_is_told(files, tmp_path, 
     said = told(capsys, files[0], other)
     assert "have different names: 'Wand' in the first, 'Port 1' in the second." in said
     assert "one depth" not in told(capsys, *files[:2])
+    # Of several, each is compared with the first; their names are folded, which adds blanks.
+    said = told(capsys, *files, other).replace(" ", "")
+    assert f"0.1000x0.1200mmin{files[0]}and0.0500x0.1200mmin{other}" in said
+    assert said.count("onedepthsetting") == 1
+    assert f"differentnames:'Wand'in{files[0]},'Port1'in{other}." in said

@@ -120,6 +120,15 @@ def test_a_wrong_spacing_is_told_with_the_right_one(slips):
     assert wrong_frames(wrong, ("scale",)) is None
 
 
+def test_points_in_mm_have_no_spacing_to_correct(slips):
+    """The advice was to estimate the scale, which is refused: points in mm have none."""
+    right = slips.recorded(5, "mm")
+    said = wrong_frames(Problem.from_arrays(right.poses, right.points * [1.6, 1.3]))
+    assert said is not None
+    assert "check what gave them their mm" in said
+    assert "estimate" not in said
+
+
 def test_pixels_that_no_image_has_are_told(slips):
     """Poses in mm that were said to be in m, and in inches, which magnetic trackers send."""
     right = slips.recorded(2, "px, unknown")

@@ -388,6 +388,7 @@ def test_frames_without_answers_are_masked_and_counted():
     assert found.missing[4] == 128
     assert found.missing[1] == 0
     assert found.warnings[0] == "2 of 11 frames could not be segmented: 4, 9"
+    assert "accepted=bool[12,128]" in repr(found)
     weak = segment(replace(images, amplitude=np.arange(12.0)), L14_5, minimum_amplitude=3.0)
     np.testing.assert_array_equal(np.flatnonzero(weak.failed), [0, 2, 4, 9])
 
@@ -403,6 +404,62 @@ def test_the_fewest_lines_of_a_frame_hold_for_both_methods(method, least, failed
     np.testing.assert_array_equal(np.flatnonzero(found.failed), failed)
 
 
+@pytest.mark.parametrize("probe", [L14_5, C5_2], ids=["linear", "curvilinear"])
+def test_times_at_the_end_of_the_receivers_window_are_no_answers(probe):
+    """At 35 us half of the frames had nothing else, and ranges were 5 mm short without a word."""
+    _, distances = draw(probe, 24, 0.2)
+    times = probe.time_of_flight_s(distances)
+    window = float(np.median(times))
+    late = times > window
+    assert late.all(axis=1).sum() > 4
+    found = segment(make_images(poses(24), np.minimum(times, window), "time_of_flight"), probe)
+    best = segment(make_images(poses(24), np.where(late, np.nan, times), "time_of_flight"), probe)
+    few = late.sum(axis=1) <= 8  # cannot be told from ties of a clock; robust weights reject them
+    kept = best.images.mask & ~few
+    assert found.failed[late.all(axis=1)].all()
+    np.testing.assert_array_equal(found.images.mask, best.images.mask)
+    np.testing.assert_allclose(
+        found.images.measurements[kept], best.images.measurements[kept], rtol=1e-12
+    )
+    assert any("the end of the receiver's window" in text for text in found.warnings)
+
+
+def test_a_time_of_zero_is_no_answer_whatever_the_delay():
+    """With a delay of -1 us they counted as echoes 1.5 mm away: ranges were 19 mm short."""
+    probe = replace(L14_5, delay_s=-1e-6)
+    _, distances = draw(probe, 12, 0.2)
+    dead = np.random.default_rng(3).random(128) < 0.4
+    silent = raw(np.where(dead, np.nan, distances), probe)
+    zero = replace(silent, measurements=np.nan_to_num(silent.measurements))
+    found, best = segment(zero, probe), segment(silent, probe)
+    np.testing.assert_array_equal(found.missing, best.missing)
+    np.testing.assert_array_equal(found.images.measurements, best.images.measurements)
+
+
+def test_ties_of_a_slow_clock_are_answers():
+    exact = np.hypot(L14_5.element_lateral(), np.linspace(60, 120, 24)[:, None])
+    distances = 1.5 * np.round(exact / 1.5)
+    assert ((distances == distances.max(axis=1, keepdims=True)).sum(axis=1) > 8).any()
+    assert segment(raw(distances, L14_5), L14_5).missing.sum() == 0
+
+
+def test_elements_in_another_order_are_named():
+    """The points were up to 20 mm off, and nothing was said."""
+    _, distances = draw(L14_5, 12, 0.2)
+    images = raw(np.roll(distances, 64, axis=1), L14_5)
+    assert any("order and the pitch" in text for text in segment(images, L14_5).warnings)
+    noisy = segment(raw(draw(L14_5, 12, 2.0)[1], L14_5), L14_5)
+    assert not noisy.warnings
+
+
+def test_a_pitch_in_another_unit_is_named():
+    """It was "covariance 0 holds a number beyond 1e+07"."""
+    _, distances = draw(L14_5, 12, 0.2)
+    recording = Recording(raw(distances, L14_5), probe=replace(L14_5, pitch_mm=0.0457))
+    with pytest.raises(InputError, match=r"of 12 frames .* probe's pitch"):
+        segment(recording)
+
+
 def test_too_few_frames_are_an_error_of_the_recording():
     _, distances = draw(L14_5, 6, 0.5)
     distances[3:] = np.nan
@@ -415,7 +472,8 @@ def test_too_few_frames_are_an_error_of_the_recording():
     [
         (lambda t: t[:, :127], "has 127 columns, the probe has 128 elements"),
         (lambda t: np.where(np.arange(6)[:, None] == 2, t * 1e6, t), "row 2 .*microseconds"),
-        (lambda t: t * 1e3, "row 0 .*give seconds"),
+        (lambda t: t * 1e3, "row 0 .*look like milliseconds; give seconds"),
+        (lambda t: t * 1e9, "row 0 .*look like nanoseconds; give seconds"),
         (lambda t: np.where(np.arange(6)[:, None] == 5, -t, t), "row 5 has a negative time"),
     ],
 )

@@ -566,6 +566,11 @@ def good_record():
         ({"version": True}, "is version 'True'"),
         ({"image_plane_to_probe": np.diag([1, 1, -1, 1]).tolist()}, "is a reflection"),
         ({"scale_mm_per_px": [0, 1]}, "must be positive"),
+        # What was changed in one matrix alone, or is missing, was passed over.
+        ({"plus_image_to_probe": np.diag([0.148, 0.14, 0.1, 1]).tolist()}, "contradicts"),
+        ({"scale_mm_per_px": None}, "plus_image_to_probe contradicts"),
+        ({"face_offset_mm": None}, "plus_image_to_probe contradicts"),
+        ({"plus_image_to_probe": "x"}, "must be numbers"),
         ({"covariance": [[1]]}, r"must have shape \(6, 6\)"),
     ],
 )
@@ -582,6 +587,8 @@ def test_json_that_lies(tmp_path, change, message):
         (np.diag([0.1, -0.1, 0.1, 1]), "is a reflection"),
         (np.diag([0.1, 0, 0.1, 1]), "flat"),
         (np.diag([0.1, 1e-10, 0.1, 1]), "pixels have no size"),
+        (np.diag([1.5e-4, 1.4e-4, 1.5e-4, 1]), "looks like metres"),
+        (np.diag([150.0, 140.0, 150.0, 1]), "give it in mm"),
         (np.diag([0.1, np.nan, 0.1, 1]), "finite"),
         (np.diag([0.1, 0.1, 0.1, 2]), "last row"),
         (np.eye(4) + np.pad([[0.1]], ((0, 3), (1, 2))), "degrees apart: fCal fitted"),
@@ -783,6 +790,22 @@ def test_apply_refuses_options_of_poses_where_a_table_has_none(saved, tmp_path, 
         assert main(["apply", str(saved), str(uv), *given]) == 2
         assert f"{given[0]}: for poses, but {uv} holds none" in capsys.readouterr().err
     assert main(["apply", str(saved), str(uv), "--skip-invalid"]) == 0
+
+
+def test_apply_refuses_poses_that_look_like_metres(saved, tmp_path, capsys):
+    """Points came out as if the probe had hardly moved, without a word."""
+    table = tmp_path / "p.csv"
+    places = np.random.default_rng(0).uniform(-0.3, 0.3, (5, 3))
+    rows = [f"300,12,{x},{y},{z},0,0,0,1" for x, y, z in places.tolist()]
+    table.write_text("\n".join(["u,v,x,y,z,qx,qy,qz,qw", *rows]))
+    assert main(["apply", str(saved), str(table)]) == 2
+    said = capsys.readouterr().err
+    assert f"{table}: pose translations reach only" in said
+    assert "look like metres; give them in mm (--pose-units m)" in said
+    assert main(["apply", str(saved), str(table), "--pose-units", "m"]) == 0
+    got = np.array([line.split(",")[:3] for line in capsys.readouterr().out.splitlines()[1:]])
+    still = random_transform().apply(np.array([[300.0, 12.0]])).points
+    np.testing.assert_allclose(got.astype(float), still + 1e3 * places, atol=1e-9)
 
 
 def test_served_to_another_client():

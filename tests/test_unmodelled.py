@@ -90,7 +90,7 @@ FAULTS = {
     "step": slipped_at_once, "distortion": distorted,
 }  # fmt: skip
 WORDS = {
-    "scale": "check pixel size",
+    "scale": "what gave the points their mm",  # not the scale, which mm do not have
     "skew": "of the depth",
     "curve": "20 mm to either side of the middle",
     "beside": "beside the image plane in all images",

@@ -139,6 +139,7 @@ def _read(source: str, options: dict[str, Any]):
         frame = (recording.pose_frames or ("Probe",))[0]
         read = images.measurements[used], images.poses[used], images.kind, which
         return *read, images.spacing_mm, frame
+    from jaxcal.data.recording import MetresError, check_pose_units
     from jaxcal.io.sources import SEQUENCES, kind_of
     from jaxcal.io.text import read_pose_table
 
@@ -154,5 +155,11 @@ def _read(source: str, options: dict[str, Any]):
     of_poses = _given(options | {"skip_invalid": False})
     if of_poses and table.poses is None:
         raise click.UsageError(f"{of_poses}: for poses, but {source} holds none")
+    unit_stated = table.length_stated or options["pose_units"] is not None
+    if table.poses is not None and not unit_stated:
+        try:
+            check_pose_units(table.poses[:, :3, 3])
+        except MetresError as error:
+            raise InputError(f"{source}: {error} (--pose-units m)") from None
     which = ("line", table.lines) if skipping else None
     return table.points, table.poses, table.kind, which, None, "Probe"

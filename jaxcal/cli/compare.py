@@ -72,7 +72,7 @@ def compare(
     shared = sorted({name for name in sources if name and sources.count(name) > 1})
     factors = {name: made.tre_factor for name, made in zip(calibrations, transforms, strict=True)}
     notes = [
-        f"The verdict of {quoted(name)} expects errors {factor:.1f} times as large as its "
+        f"The verdict of {name} expects errors {factor:.1f} times as large as its "
         "covariance says. The expected distances do not include this."
         for name, factor in factors.items()
         if factor > 1
@@ -84,15 +84,24 @@ def compare(
     ]
     if as_json:
         print_json({"pairs": [_record(*pair) for pair in pairs], "tre_factor": factors})
-    elif len(pairs) == 1:
-        unit = "mm" if transforms[0].scale_mm_per_px is None else "px"
-        names, sizes = zip(
-            *((each.probe_frame, each.scale_mm_per_px) for each in transforms), strict=True
-        )
-        words = [_sentence(pairs[0][2]), *what_differs(names, sizes, ("the first", "the second"))]
-        print_page(_table_of_points(pairs[0][2], unit), *words, *notes)
     else:
-        print_page(_table_of_pairs(pairs), _summary([pair[2] for pair in pairs]), *notes)
+        one = len(pairs) == 1
+        whose = ["the first", "the second"] if one else list(calibrations)
+        words = [
+            differing
+            for made, name in zip(transforms[1:], whose[1:], strict=True)
+            for differing in what_differs(
+                (transforms[0].probe_frame, made.probe_frame),
+                (transforms[0].scale_mm_per_px, made.scale_mm_per_px),
+                (whose[0], name),
+            )
+        ]
+        if one:
+            unit = "mm" if transforms[0].scale_mm_per_px is None else "px"
+            shown = _table_of_points(pairs[0][2], unit), _sentence(pairs[0][2])
+        else:
+            shown = _table_of_pairs(pairs), _summary([pair[2] for pair in pairs])
+        print_page(*shown, *words, *notes)
     apart = any(pair[2].agree is False for pair in pairs)
     return ExitCode.UNCERTAIN if apart else ExitCode.CONVERGED
 

@@ -22,6 +22,7 @@ from jaxcal.diagnostics.intervals import LEVEL, length_quantile
 from jaxcal.result.calibration import Calibration
 from jaxcal.result.transform import ImageTransform
 from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.arrays import outline
 from jaxcal.runtime.given_values import check_made
 
 _LEAST_SHARE = 1e-6
@@ -49,6 +50,8 @@ class Comparison:
     expected_rms_mm: float
     limit_mm: float
     rotation_deg: float
+
+    __repr__ = outline
 
     @property
     def agree(self) -> bool | None:

@@ -283,14 +283,17 @@ def _wrong_scale(data: ImageData, fit: _Fit) -> str | None:
                 in_mm = unit if factor < 1 else 1.0
                 return _sentence(told, before, in_mm**2 * free, count)
     if not data.pixels:
-        told = f"the points are {scales[0]:.3g} and {scales[1]:.3g} times as long as given"
+        told = (
+            f"the points are {scales[0]:.3g} and {scales[1]:.3g} times as long as given: check "
+            "what gave them their mm (pixel size, sound speed, pitch of the elements)"
+        )
     else:
         size = scales * data.spacing
         told = (
             f"the pixels are {size[0]:.4g} x {size[1]:.4g} mm, not {data.spacing[0]:.4g} x "
-            f"{data.spacing[1]:.4g}"
+            f"{data.spacing[1]:.4g}: correct the spacing, or estimate the scale"
         )
-    return _sentence(f"{told}: correct the spacing, or estimate the scale", before, free, count)
+    return _sentence(told, before, free, count)
 
 
 def _sentence(words: str, before: float, after: float, count: int) -> str:

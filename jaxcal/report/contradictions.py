@@ -141,11 +141,17 @@ def _from_unmodelled(record: dict[str, Any]) -> list[tuple[float, str]]:
     if found is None or not stated:
         return []
     values, moved = found["values"], found["moved_mm"]
+    if record["scale_mm_per_px"] is None:
+        lengths = (
+            "check what gave the points their mm (pixel size, sound speed, pitch of the elements) "
+            "and the tracker's unit"
+        )
+    else:
+        lengths = "check pixel size, sound speed and the tracker's unit, or estimate the scale"
     words = {
         "scale": lambda: (
             f"lateral positions that are too long by {100 * values[0]:.1f} % and ranges by "
-            f"{100 * values[1]:.1f} % would explain the errors far better: check pixel size, "
-            "sound speed and the tracker's unit, or estimate the scale"
+            f"{100 * values[1]:.1f} % would explain the errors far better: {lengths}"
         ),
         "slip": lambda: (
             f"an image that moves by {found['slip_mm']:.1f} mm on the probe from the first image "

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.arrays import outline
 
 Array = np.ndarray
 
@@ -41,6 +42,8 @@ class Inspection:
     misfit: Float[Array, "*batch 5 3"]
     gain: Float[Array, "*batch 5"]
 
+    __repr__ = outline
+
 
 @dataclass(frozen=True)
 class Summary:
@@ -57,3 +60,5 @@ class Summary:
     weakest_sd: Float[Array, "*batch"]
     prior_direction: Float[Array, "*batch p"]
     inspection: Inspection
+
+    __repr__ = outline

@@ -41,6 +41,10 @@ _NPZ = (
     "converged",
     "date",
 )
+_ROUNDED = 1e-4
+"""Relative difference of the columns of two matrices of a record that rounding explains."""
+_ROUNDED_MM = 1e-6
+
 _NPZ_BYTES = 65536
 """Largest size of an ``.npz``, also unpacked."""
 
@@ -443,7 +447,7 @@ def transform_from_record(record: dict[str, Any], *, source: str = "memory") -> 
         "image_covariance": _array(record, "image_covariance", (size, size)),
         "probe_frame": named if isinstance(named, str) else None,
     }
-    return ImageTransform(
+    found = ImageTransform(
         matrix,
         converged=usable and not record.get("wrong_frames"),
         source=source,
@@ -451,6 +455,22 @@ def transform_from_record(record: dict[str, Any], *, source: str = "memory") -> 
         date=date,
         **{name: value for name, value in given.items() if value is not None},
     )
+    stated = _array(record, "plus_image_to_probe", (4, 4)) if found.converged is not False else None
+    if stated is not None and not _agrees(found, stated):
+        raise FormatError(
+            "plus_image_to_probe contradicts image_plane_to_probe, scale_mm_per_px, face_offset_mm "
+            "and range_factor: one of them was changed alone, or is missing"
+        )
+    return found
+
+
+def _agrees(transform: ImageTransform, stated: np.ndarray) -> bool:
+    """Whether PLUS's matrix in a record is that of the transform, but for rounding."""
+    if transform.scale_mm_per_px is None:
+        return False
+    made = transform.plus_matrix()
+    far = np.linalg.norm(made - stated, axis=0)
+    return bool((far <= _ROUNDED * np.linalg.norm(made, axis=0) + _ROUNDED_MM).all())
 
 
 def _unknowns(record: dict[str, Any]) -> tuple[str, ...]:

@@ -31,6 +31,7 @@ from jaxcal.io.given_files import naming
 from jaxcal.model.image_points import point_jacobian
 from jaxcal.model.unknowns import TABLE, tangent_names
 from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.arrays import outline
 from jaxcal.runtime.given_values import check_flag, real_array
 from jaxcal.runtime.messages import shown
 
@@ -56,6 +57,8 @@ class AppliedPoints:
 
     points: Float[np.ndarray, "n 3"]
     covariance: Float[np.ndarray, "n 3 3"]
+
+    __repr__ = outline
 
 
 @dataclass(frozen=True, eq=False)
@@ -427,15 +430,17 @@ def transform_from_plus_matrix(
         source: the file, for messages.
 
     Raises:
-        InputError: NaN, a last row other than 0 0 0 1, a reflection, pixels without a size, or
-            columns that are not orthogonal to 1e-3, which a rigid transform with a pixel size
-            cannot have.
+        InputError: NaN, a last row other than 0 0 0 1, a reflection, pixels without a size or of
+            one that is not in mm, or columns that are not orthogonal to 1e-3, which a rigid
+            transform with a pixel size cannot have.
     """
     with naming(source):
         matrix = check_affine(matrix)
     scale = np.linalg.norm(matrix[:3, :2], axis=0)
     if not (scale > 1e-9).all():
         raise InputError(f"{source}: a column of the matrix is zero: the pixels have no size")
+    with naming(source):
+        check_spacing_unit(scale)
     lateral, axial = (matrix[:3, :2] / scale).T
     if abs(lateral @ axial) > _SKEWED:
         raise InputError(

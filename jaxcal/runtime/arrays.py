@@ -103,8 +103,8 @@ def array_tree(kind: type[T]) -> type[T]:
     return kind
 
 
-def outline(tree: Any) -> str:
-    """The fields of a tree; long arrays, and those without values as under jit, by their shape."""
+def outline(self: Any) -> str:
+    """The ``repr`` of a dataclass; long arrays, and those without values (jit), by their shape."""
 
     def short(value: Any) -> str:
         small = has_values(value) and np.size(value) <= _LONGEST_SHOWN
@@ -112,9 +112,9 @@ def outline(tree: Any) -> str:
             return repr(value)
         return f"{value.dtype}[{','.join(map(str, value.shape))}]"
 
-    names = (field.name for field in dataclasses.fields(tree))
-    told = ", ".join(f"{name}={short(getattr(tree, name))}" for name in names)
-    return f"{type(tree).__name__}({told})"
+    names = (field.name for field in dataclasses.fields(self))
+    told = ", ".join(f"{name}={short(getattr(self, name))}" for name in names)
+    return f"{type(self).__name__}({told})"
 
 
 def has_values(*arrays: Any) -> bool:

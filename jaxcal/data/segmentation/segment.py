@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float, Int
 from jaxcal import InputError
 from jaxcal.data.probe import MOST_ELEMENTS, CurvilinearProbe, Probe, check_probe
 from jaxcal.data.recording import (
+    LARGEST,
     MINIMUM_IMAGES,
     Images,
     Recording,
@@ -33,10 +34,11 @@ from jaxcal.data.segmentation.time_of_flight import (
 )
 from jaxcal.runtime import executables
 from jaxcal.runtime.array_types import AnyArray
+from jaxcal.runtime.arrays import outline
 from jaxcal.runtime.compiler import ONE_PROBLEM, batch_flags, fast_to_run
 from jaxcal.runtime.given_values import check_flag, is_number, whole_number
 from jaxcal.runtime.jax_modes import in_own_modes
-from jaxcal.runtime.messages import shown
+from jaxcal.runtime.messages import counted, shown
 
 Method = Literal["least-squares", "shortest"]
 Scale = Literal["frame", "pooled"]
@@ -54,6 +56,10 @@ _NOISIEST = 5.0
 _MANY = 0.1
 # An answer this many SDs from the fit is not the target's.
 _FAR = 6.0
+# Receivers and waves have less noise; elements in another order or of another pitch give more.
+_NOISY_MM = 3.0
+# A clock's ties are at most about as many at the longest time as at the next shorter one.
+_TIES = 4
 # Up to this many frames, compiling takes longer than the fit.
 _FEW_FRAMES = 4096
 
@@ -82,6 +88,8 @@ class OutOfPlane:
     elevation: Float[np.ndarray, " n"]
     elevation_sd: Float[np.ndarray, " n"]
     determined: Bool[np.ndarray, " n"]
+
+    __repr__ = outline
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,6 +122,8 @@ class Segmentation:
     out_of_plane: OutOfPlane | None = None
     warnings: tuple[str, ...] = ()
 
+    __repr__ = outline
+
 
 @in_own_modes
 def segment(
@@ -128,6 +138,9 @@ def segment(
     minimum_amplitude: float | None = None,
 ) -> Segmentation:
     """Segment the target in every frame of times of flight.
+
+    No answer is NaN, or 0. If more than 8 elements have exactly the longest time of their frame, it
+    is taken for the end of the receiver's window, and they for elements without an answer.
 
     Points of a curved array come from the in-plane fit, which is what an image would show. The
     array's own estimate of the elevation is so uncertain (y^2 has an SD of hundreds of mm^2 for a
@@ -151,8 +164,8 @@ def segment(
 
     Raises:
         InputError: no times of flight, no probe, times for another number of elements, negative
-            times, microseconds, options of another kind or of the other method; for a recording,
-            fewer than 4 frames that can be segmented.
+            times, another unit than seconds, options of another kind or of the other method; for a
+            recording, fewer than 4 frames that can be segmented.
     """
     images = images_of(data, "jaxcal.segment")
     probe = data.probe if probe is None and isinstance(data, Recording) else probe
@@ -169,7 +182,9 @@ def segment(
     check_probe(probe)
     used = images.mask
     check_times_of_flight(times, probe, used)
-    distances = np.where(used[:, None], probe.one_way_range_mm(times), np.nan)
+    cut = used[:, None] & _end_of_window(times)
+    answered = used[:, None] & ~cut & (times > 0)
+    distances = np.where(answered, probe.one_way_range_mm(times), np.nan)
     accepted = np.isfinite(distances) & (distances > 0)
     lines = accepted.sum(axis=1)
 
@@ -187,7 +202,8 @@ def segment(
         failed |= used & (2 * rejected > lines)
         if robust:
             accepted &= _near(distances, probe, points if full is None else full[0], noise)
-        good = np.isfinite(covariance).all(axis=(1, 2))
+        with np.errstate(invalid="ignore"):
+            good = (np.abs(covariance) <= LARGEST).all(axis=(1, 2))
         failed |= used & ~good
         if robust and (used & ~failed).any():
             typical = max(float(np.median(noise[used & ~failed])), 1e-3)
@@ -200,7 +216,8 @@ def segment(
     if isinstance(data, Recording) and mask.sum() < MINIMUM_IMAGES:
         raise InputError(
             f"only {int(mask.sum())} of {int(used.sum())} frames of times of flight could be "
-            f"segmented: at least {MINIMUM_IMAGES} are needed"
+            f"segmented: at least {MINIMUM_IMAGES} are needed; if they hold answers, check the "
+            "probe's pitch, sound speed and delay"
         )
     segmented = make_images(
         images.poses,
@@ -227,7 +244,7 @@ def segment(
         accepted=accepted & mask[:, None],
         noise_mm=np.where(mask, noise, np.nan),
         out_of_plane=out_of_plane,
-        warnings=_warnings(used, failed, missing, rejected, probe.elements),
+        warnings=_warnings(used, failed, missing, rejected, cut, noise[mask], probe.elements),
     )
 
 
@@ -311,10 +328,30 @@ def check_times_of_flight(
     if wrong.any():
         row = int(np.flatnonzero(wrong)[0])
         middle = float(np.nanmedian(rows[row]))
+        unit = "milli" if middle < 1 else "micro" if middle < 1e3 else "nano"
         raise InputError(
             f"time_of_flight row {row} has times about {middle:.4g} s, a path of "
-            f"{probe.sound_speed_m_s * middle:.3g} m: they look like microseconds; give seconds"
+            f"{probe.sound_speed_m_s * middle:.3g} m: they look like {unit}seconds; give seconds"
         )
+
+
+def _end_of_window(
+    times: Float[np.ndarray, "n elements"],
+) -> Bool[np.ndarray, "n elements"]:
+    """Times that a receiver wrote where it heard nothing until the end of its window.
+
+    More than 8 elements of a frame have exactly its longest time. With a clock, the target's own
+    times are equal in runs; they change fastest far from the target, where the longest ones are.
+    """
+    answers = np.where(np.isfinite(times), times, -np.inf)
+    longest = answers.max(axis=1, keepdims=True)
+    equal = np.isfinite(times) & (times == longest)
+    shorter = np.where(equal, -np.inf, answers)
+    next_longest = shorter.max(axis=1, keepdims=True)
+    next_equal = np.isfinite(shorter) & (shorter == next_longest)
+    count = equal.sum(axis=1)
+    cut = (count > MINIMUM_LINES) & (count > _TIES * next_equal.sum(axis=1))
+    return equal & cut[:, None]
 
 
 def _shortest(
@@ -421,8 +458,23 @@ def _fitted(
     return jax.tree.map(lambda leaf: leaf[:count], found)
 
 
-def _warnings(used, failed, missing, rejected, elements: int) -> tuple[str, ...]:
+def _warnings(
+    used, failed, missing, rejected, cut, noise_mm: np.ndarray, elements: int
+) -> tuple[str, ...]:
     found = []
+    known = noise_mm[np.isfinite(noise_mm)]
+    if known.size and np.median(known) > _NOISY_MM:
+        found.append(
+            f"the distances to the elements differ by {np.median(known):.2g} mm (SD) from those of "
+            "a target: check the order and the pitch of the elements, and that the times are "
+            "one-way"
+        )
+    if cut.any():
+        found.append(
+            f"{int(cut.sum())} lines in {counted(int(cut.any(axis=1).sum()), 'frame')} have "
+            "exactly the longest time of their frame, the end of the receiver's window: they did "
+            "not answer"
+        )
     if failed.any():
         rows = np.flatnonzero(failed)
         named = ", ".join(map(str, rows[:8])) + (", ..." if len(rows) > 8 else "")
