@@ -190,8 +190,11 @@ def _weak_direction(result: Calibration) -> list[str]:
 
 
 def _unusual_pixels(result: Calibration) -> list[str]:
-    """A warning about estimated pixel sizes that hardly any image has."""
-    if result.scale_mm_per_px is None or "scale" not in result.blocks:
+    """A warning about estimated pixel sizes that hardly any image has, or a unit in doubt."""
+    if result.doubtful_unit is not None:
+        return [result.doubtful_unit]
+    problem = result.problem
+    if result.scale_mm_per_px is None or problem is None or problem.spacing_known:
         return []
     lateral, axial = (float(size) for size in np.asarray(result.scale_mm_per_px))
     least, largest = USUAL_PIXEL_MM
