@@ -168,7 +168,7 @@ def test_a_unit_in_doubt_leaves_the_error_unknown_until_it_is_stated(slips):
         assert (record["tre"] is None) == doubted
         assert (next_poses_record(result, recording) is None) == doubted
         lines = verdict(record)
-        said = "Uncertain: the poses' translations may be in cm or inches, since the pixels"
+        said = "Uncertain: the poses' translations may be in cm or inches: the pixels"
         assert lines[0].startswith(said) == doubted
         assert ("--pose-units) or, if it is mm, the size of a pixel" in lines[0]) == doubted
         assert sum("may be in cm" in line for line in lines) == doubted
@@ -178,7 +178,7 @@ def test_a_unit_in_doubt_leaves_the_error_unknown_until_it_is_stated(slips):
         (small_probe(1.0), False),
         (small_probe(0.1), True),
         (small_probe(0.1, (0.002, 0.002)), False),
-        (small_probe(60.0), True),
+        (small_probe(100.0), True),
     ):
         assert (doubtful_unit(Problem.from_recording(images)) is not None) == doubted
 

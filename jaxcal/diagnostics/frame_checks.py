@@ -71,8 +71,8 @@ NEAR_MARKER_MM, NEAR_TRACKER_MM = 40.0, 300.0
 """With poses in cm, a target 400 mm from the probe's markers or a probe 3 m from the tracker comes
 out at these distances; hardly any is farther. Whatever comes out farther is in mm."""
 
-LARGE_PIXEL_MM = 1.0
-"""The unit is in doubt where pixels are larger."""
+LARGE_PIXEL_MM = 1.5
+"""The unit is in doubt where pixels are larger. Points in mm that are read as pixels have 1 mm."""
 
 SAME_SCALE = 1.25
 """With a slip corrected, known scales must come out within this factor."""
@@ -141,7 +141,10 @@ def wrong_frames(problem: Problem, estimate: tuple[str, ...] = ()) -> str | None
         )
     size = fit.scales * given.spacing
     if not known and not PIXELS_MM[0] <= size.max() <= PIXELS_MM[1]:
-        return f"the pixels come out as {_sizes(size)}: are the poses' translations in mm?"
+        return (
+            f"the pixels come out as {_sizes(size)}: are the poses' translations in mm? (jaxcal "
+            "import --pose-units states another unit)"
+        )
     if known and "scale" in estimate and _another_unit(fit.scales) and 3 * count > 2 * UNKNOWNS:
         return (
             f"the pixels come out as {_sizes(size)}, but were said to have {_sizes(given.spacing)}:"
@@ -175,8 +178,8 @@ def doubtful_unit(problem: Problem) -> str | None:
     )
     if size.max() > LARGE_PIXEL_MM:
         return (
-            f"the poses' translations may not be in mm, since the pixels come out as {_sizes(size)}"
-            f", larger than those of ultrasound: {state}"
+            f"the poses' translations may not be in mm: the pixels come out as {_sizes(size)}, "
+            f"which hardly any image has; {state}"
         )
     pixel = np.sqrt(size.prod())
     if pixel > SMALL_PIXEL_MM:
@@ -195,9 +198,9 @@ def doubtful_unit(problem: Problem) -> str | None:
     ):
         return None
     return (
-        f"the poses' translations may be in cm or inches, since the pixels come out as "
-        f"{_sizes(size)} and the errors within the image as {error:.2g} mm: few probes and "
-        f"trackers have so small ones; {state}"
+        f"the poses' translations may be in cm or inches: the pixels come out as {_sizes(size)} "
+        f"and the errors within the image as {error:.2g} mm, which few probes and trackers reach; "
+        f"{state}"
     )
 
 
