@@ -140,6 +140,25 @@ def test_pixels_that_no_image_has_are_told(slips):
         assert re.match(rf"the pixels come out as {size} mm: are the poses", said)
 
 
+def test_poses_composed_in_the_wrong_order_are_asked_about(slips):
+    """Probe times inverse reference fits as well; X is then that to the reference's tracker."""
+    right = slips.recorded(4, "mm")
+    reference = np.eye(4)
+    reference[:3, :3] = Rotation.from_rotvec([0.4, -0.2, 0.9]).as_matrix()
+    reference[:3, 3] = [200.0, -300.0, 1500.0]
+    for poses, asked in (
+        (inverse_poses(reference[None]) @ right.poses, False),
+        (right.poses @ inverse_poses(reference[None]), True),
+    ):
+        result = jaxcal.calibrate(
+            jaxcal.Recording(make_images(poses, right.points)), "conventional"
+        )
+        assert result.wrong_frames is None
+        said = [text for text in result.warnings if "from the origin of the probe's frame" in text]
+        assert len(said) == asked
+        assert not asked or "the target is 1.5 m from" in said[0]
+
+
 def small_probe(factor: float, spacing: tuple[float, float] | None = None):
     """A probe of high frequency: every length a tenth, errors of 0.2 mm; poses in some unit."""
     rng = np.random.default_rng(8)
