@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from contextlib import nullcontext
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -14,6 +15,7 @@ from scipy.spatial.transform import Rotation
 import jaxcal
 from jaxcal import Problem
 from jaxcal.cli.common import ExitCode, exit_code, verdict_code
+from jaxcal.cli.plan import refuse_wrong_lengths
 from jaxcal.data.poses import inverse_poses
 from jaxcal.data.recording import make_images
 from jaxcal.diagnostics.frame_checks import doubtful_unit, wrong_frames
@@ -186,6 +188,8 @@ def test_a_unit_in_doubt_leaves_the_error_unknown_until_it_is_stated(slips):
         assert (verdict_code(record) == ExitCode.UNCERTAIN) == doubted
         assert (record["tre"] is None) == doubted
         assert (next_poses_record(result, recording) is None) == doubted
+        with pytest.raises(jaxcal.InputError, match="in cm") if doubted else nullcontext():
+            refuse_wrong_lengths(result, "rec.h5")
         lines = verdict(record)
         said = "Uncertain: the poses' translations may be in cm or inches: the pixels"
         assert lines[0].startswith(said) == doubted
