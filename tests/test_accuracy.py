@@ -672,7 +672,7 @@ def test_pixels_of_an_unusual_size_are_named():
             "conventional",
             estimate="scale",
         )
-        unusual = [text for text in found.warnings if "are unusual for ultrasound" in text]
+        unusual = [text for text in found.warnings if "may be in cm or inches" in text]
         assert len(unusual) == (factor < 1)
 
 

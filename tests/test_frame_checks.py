@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from contextlib import nullcontext
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -13,10 +14,11 @@ from scipy.spatial.transform import Rotation
 
 import jaxcal
 from jaxcal import Problem
-from jaxcal.cli.common import ExitCode, exit_code
+from jaxcal.cli.common import ExitCode, exit_code, verdict_code
+from jaxcal.cli.plan import refuse_wrong_lengths
 from jaxcal.data.poses import inverse_poses
 from jaxcal.data.recording import make_images
-from jaxcal.diagnostics.frame_checks import wrong_frames
+from jaxcal.diagnostics.frame_checks import doubtful_unit, wrong_frames
 from jaxcal.io.text import read_crosswire
 from jaxcal.report.next_poses import next_poses_record
 from jaxcal.report.record import calibration_record
@@ -28,7 +30,7 @@ BY_SYMMETRY = {("px, unknown", "u and v swapped")} | {
 }
 """No fit can see these (:mod:`jaxcal.diagnostics.frame_checks`)."""
 FREE_UNIT = ("px, unknown", "poses in cm")
-"""A pixel of a hundredth of a millimetre is possible."""
+"""A pixel of a hundredth of a millimetre is possible, but doubtful."""
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +47,10 @@ def test_every_slip_is_named_or_refused_and_no_right_file_is(slips, form):
         for number in range(FILES):
             arrays = make(slips.recorded(number, form))
             try:
-                said = wrong_frames(Problem.from_recording(arrays.images()))
+                problem = Problem.from_recording(arrays.images())
+                said = wrong_frames(problem)
+                in_doubt = (form, slip) == FREE_UNIT
+                assert said or (doubtful_unit(problem) is not None) == in_doubt, (slip, number)
             except jaxcal.InputError as error:
                 said = str(error)
             if slip == "none" or (form, slip) in BY_SYMMETRY or (form, slip) == FREE_UNIT:
@@ -118,6 +123,11 @@ def test_a_wrong_spacing_is_told_with_the_right_one(slips):
     wrong = replace(data, spacing=1.4 * data.spacing)
     assert wrong_frames(wrong) is not None
     assert wrong_frames(wrong, ("scale",)) is None
+    # But nobody mistakes it for a tenth.
+    poses = np.array(data.poses)
+    poses[:, :3, 3] /= 10
+    said = wrong_frames(replace(data, poses=poses), ("scale",)) or ""
+    assert re.match(r"the pixels come out as 0.0\d+ x 0.012 mm, .* have 0.1 x 0.12 mm: are", said)
 
 
 def test_points_in_mm_have_no_spacing_to_correct(slips):
@@ -139,6 +149,70 @@ def test_pixels_that_no_image_has_are_told(slips):
         said = wrong_frames(Problem.from_recording(replace(right, poses=poses).images()))
         assert said is not None
         assert re.match(rf"the pixels come out as {size} mm: are the poses", said)
+
+
+def test_poses_composed_in_the_wrong_order_are_asked_about(slips):
+    """Probe times inverse reference fits as well; X is then that to the reference's tracker."""
+    right = slips.recorded(4, "mm")
+    reference = np.eye(4)
+    reference[:3, :3] = Rotation.from_rotvec([0.4, -0.2, 0.9]).as_matrix()
+    reference[:3, 3] = [200.0, -300.0, 1500.0]
+    for poses, asked in (
+        (inverse_poses(reference[None]) @ right.poses, False),
+        (right.poses @ inverse_poses(reference[None]), True),
+    ):
+        result = jaxcal.calibrate(
+            jaxcal.Recording(make_images(poses, right.points)), "conventional"
+        )
+        assert result.wrong_frames is None
+        said = [text for text in result.warnings if "from the origin of the probe's frame" in text]
+        assert len(said) == asked
+        assert not asked or "the target is 1.5 m from" in said[0]
+
+
+def small_probe(factor: float, spacing: tuple[float, float] | None = None):
+    """A probe of high frequency: every length a tenth, errors of 0.2 mm; poses in some unit."""
+    rng = np.random.default_rng(8)
+    turns = Rotation.from_rotvec(rng.uniform(-0.4, 0.4, (30, 3))).as_matrix()
+    seen = np.stack([rng.uniform(-5, 5, 30), rng.uniform(-0.2, 0.2, 30), rng.uniform(2, 12, 30)], 1)
+    poses = np.tile(np.eye(4), (30, 1, 1))
+    poses[:, :3, :3] = turns
+    at = [80.0, 20.0, 150.0] - np.einsum("nij,nj->ni", turns, seen + np.array([10, 5, 20]))
+    poses[:, :3, 3] = factor * (at + 0.2 * rng.normal(size=(30, 3)))
+    return make_images(poses, seen[:, [0, 2]] / 0.02 + [300, 0], "pixel", spacing_mm=spacing)
+
+
+def test_a_unit_in_doubt_leaves_the_error_unknown_until_it_is_stated(slips):
+    """Poses in cm or inches fit as well, and small probes have small pixels."""
+    right = slips.recorded(3, "px, unknown")
+    for factor in (0.1, 1.0):
+        poses = right.poses.copy()
+        poses[:, :3, 3] *= factor
+        recording = jaxcal.Recording(replace(right, poses=poses).images())
+        result = jaxcal.calibrate(recording, "conventional", estimate="scale")
+        record = calibration_record(result, recording)
+        doubted = factor < 1
+        assert (record["doubtful_unit"] is not None) == doubted
+        assert (record["verdict"] == "uncertain") == doubted
+        assert (verdict_code(record) == ExitCode.UNCERTAIN) == doubted
+        assert (record["tre"] is None) == doubted
+        assert (next_poses_record(result, recording) is None) == doubted
+        with pytest.raises(jaxcal.InputError, match="in cm") if doubted else nullcontext():
+            refuse_wrong_lengths(result, "rec.h5")
+        lines = verdict(record)
+        said = "Uncertain: the poses' translations may be in cm or inches: the pixels"
+        assert lines[0].startswith(said) == doubted
+        assert ("--pose-units) or, if it is mm, the size of a pixel" in lines[0]) == doubted
+        assert sum("may be in cm" in line for line in lines) == doubted
+        # Further images are no help.
+        assert not (doubted and any("Add images" in line for line in lines))
+    for images, doubted in (
+        (small_probe(1.0), False),
+        (small_probe(0.1), True),
+        (small_probe(0.1, (0.002, 0.002)), False),
+        (small_probe(100.0), True),
+    ):
+        assert (doubtful_unit(Problem.from_recording(images)) is not None) == doubted
 
 
 def test_the_verdict_is_do_not_use_and_the_exit_status_says_so(slips):
@@ -182,6 +256,10 @@ def test_the_real_recording_and_its_wrong_twins(real_data):
         folder / "crossWirePhantomTransformations.txt", folder / "crossWirePhantom2DPoints.txt"
     ).calibration
     assert wrong_frames(Problem.from_recording(images)) is None
+    assert doubtful_unit(Problem.from_recording(images)) is None
+    other = images.poses.copy()
+    other[:, :3, 3] /= 10
+    assert doubtful_unit(Problem.from_recording(replace(images, poses=other))) is not None
     known = replace(images, spacing_mm=np.array([0.1478, 0.1398]))
     assert wrong_frames(Problem.from_recording(known)) is None
     turned = images.poses.copy()

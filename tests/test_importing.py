@@ -71,6 +71,8 @@ MATRIX = [f"m{i}{j}" for i in range(1, 4) for j in range(1, 5)]
         table(["U [px]", "V [px]", "Tx (mm)", "Ty (mm)", "Tz (mm)", *NAMES[5:]], COLUMNS),
         table(["u_px", "v_px", "tx_m", "ty_m", "tz_m", *NAMES[5:]],
               [PIXELS, TRANSLATIONS / 1e3, QUATERNIONS]),
+        table([*NAMES[:2], "x [in]", "y (inches)", "z_in", *NAMES[5:]],
+              [PIXELS, TRANSLATIONS / 25.4, QUATERNIONS]),
         table([*NAMES[:5], "q0", "qx", "qy", "qz"], SCALAR_FIRST),
         table([*NAMES[:2], "position.x", "position.y", "position.z", "orientation.x",
                "orientation.y", "orientation.z", "orientation.w"], COLUMNS),
@@ -149,6 +151,8 @@ def test_the_poses_of_a_pair_may_be_in_metres(tmp_path):
         import_files(pair(1e-3))
     images = import_files(pair(1e-3), ImportOptions(pose_units="m"))[0].calibration
     np.testing.assert_allclose(images.poses, POSES, atol=1e-11)
+    images = import_files(pair(1 / 25.4), ImportOptions(pose_units="in"))[0].calibration
+    np.testing.assert_allclose(images.poses, POSES, atol=1e-11)
     with pytest.raises(InputError, match="--quaternion does not go with a pair"):
         import_files(pair(1.0), ImportOptions(quaternion="wxyz"))
 
@@ -197,7 +201,7 @@ def test_empty_rows_at_the_end_do_not_count(tmp_path):
         (["u [px]", "v [mm]", *NAMES[2:]], "different units"),
         ([*MATRIX, "x", "y", "z"], "both a whole matrix and x, y, z"),
         ([*MATRIX, "qx", "qy", "qz", "qw"], "both a matrix and a quaternion"),
-        (["u", "v", "x [in]", *NAMES[3:]], "unit of 'x [in]' is not known"),
+        (["u", "v", "x [ft]", *NAMES[3:]], "unit of 'x [ft]' is not known"),
         (["u", "v", "x", "y", "z", "qx", "qy", "qz", "frame"], "not all of qx, qy, qz and qw"),
     ],
 )

@@ -88,3 +88,21 @@ for centred in table("off_centre"):
             "| {:.0f} | {:.0f} | {:.0f} | {:.0f} | {:.0f} | {:.0f} |",
             lambda row=centred: _off_centre(row),
         )
+
+
+# Poses in another unit than mm.
+def _told_of_unit(group: str, *columns: str) -> float:
+    return sum(sum(column("pose_unit", of, group=group)) for of in columns)
+
+
+claim(
+    TRUST,
+    "Of {:.0f} simulated recordings with poses in cm, {:.0f} were told of in this way or as wrong "
+    "units; of {:.0f} in mm none was with ordinary probes, and {:.0f} with small probes",
+    lambda: (
+        _told_of_unit("ordinary probe, cm", "recordings"),
+        _told_of_unit("ordinary probe, cm", "named", "doubted"),
+        _told_of_unit("small probe, mm", "recordings"),
+        _told_of_unit("small probe, mm", "named", "doubted"),
+    ),
+)

@@ -266,6 +266,16 @@ def _from_nothing(
     )
 
 
+def refuse_wrong_lengths(result: Calibration, path: str) -> None:
+    """Refuse to plan in wrong frames or units: a robot would move by wrong lengths.
+
+    Raises:
+        InputError: wrong frames, or poses that may be in another unit than mm.
+    """
+    if told := result.wrong_frames or result.doubtful_unit:
+        raise InputError(f"{path}: {told}")
+
+
 def _from_recording(
     path: str,
     estimate: str | None,
@@ -300,8 +310,7 @@ def _from_recording(
         result = calibrate(measured, estimate=names)
     if result.status == "failed":
         raise InputError(f"{path}: the calibration failed: there is nothing to plan from")
-    if result.wrong_frames is not None:
-        raise InputError(f"{path}: {result.wrong_frames}")
+    refuse_wrong_lengths(result, path)
     if probe is not None and measured.probe is None:
         measured = replace(measured, probe=PRESETS[probe])
 

@@ -81,8 +81,9 @@ TRACKING = (
 TABLES = (
     click.option(
         "--pose-units",
-        type=click.Choice(["mm", "cm", "m"]),
-        help="Unit of translations if the file of the poses does not say it; mm by default.",
+        type=click.Choice(["mm", "cm", "m", "in"]),
+        help="Unit of translations if the file of the poses does not say it; mm by default. Some "
+        "electromagnetic trackers send inches (in).",
     ),
     click.option(
         "--quaternion",

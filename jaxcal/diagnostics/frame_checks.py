@@ -58,6 +58,22 @@ MOST_IMAGES = 150
 PIXELS_MM = (0.008, 3.0)
 """Smallest and largest credible size of a pixel: with poses in inches, 0.2 mm become 0.0079."""
 
+STATED_TWICE = 2.0
+"""A pixel size that is given and estimated as well must come out within this factor."""
+
+TINY_PIXEL_MM = 0.0125
+SMALL_PIXEL_MM, SMALL_ERROR_MM = 0.045, 0.1
+"""The unit of the poses is in doubt where pixels are tiny, or small (with poses in cm, 0.45 mm
+become 0.045) with smaller errors within the image than these. Small pixels belong to high
+frequencies, but few trackers are so precise."""
+
+NEAR_MARKER_MM, NEAR_TRACKER_MM = 40.0, 300.0
+"""With poses in cm, a target 400 mm from the probe's markers or a probe 3 m from the tracker comes
+out at these distances; hardly any is farther. Whatever comes out farther is in mm."""
+
+LARGE_PIXEL_MM = 1.5
+"""The unit is in doubt where pixels are larger. Points in mm that are read as pixels have 1 mm."""
+
 SAME_SCALE = 1.25
 """With a slip corrected, known scales must come out within this factor."""
 
@@ -126,10 +142,75 @@ def wrong_frames(problem: Problem, estimate: tuple[str, ...] = ()) -> str | None
     size = fit.scales * given.spacing
     if not known and not PIXELS_MM[0] <= size.max() <= PIXELS_MM[1]:
         return (
-            f"the pixels come out as {size[0]:.3g} x {size[1]:.3g} mm: are the poses' translations "
-            "in mm?"
+            f"the pixels come out as {_sizes(size)}: are the poses' translations in mm? (jaxcal "
+            "import --pose-units states another unit)"
+        )
+    if known and "scale" in estimate and _another_unit(fit.scales) and 3 * count > 2 * UNKNOWNS:
+        return (
+            f"the pixels come out as {_sizes(size)}, but were said to have {_sizes(given.spacing)}:"
+            " are the poses' translations in mm? (else correct the spacing, or leave it out)"
         )
     return None
+
+
+def doubtful_unit(problem: Problem) -> str | None:
+    """Why the poses may be in another unit than mm, and what to do, in one line; None if in mm.
+
+    Where the size of pixels is unknown, poses in cm or inches fit as well as those in mm: the
+    image, the probe and all errors only come out smaller. A small probe of high frequency is
+    small as well, but its tracker is no better than others.
+    """
+    if problem.spacing_known:
+        return None
+    try:
+        images, _ = image_data(problem, ("scale",))
+    except InputError:
+        return None
+    given = _out_of_step(replace(images, face_offset=0.0), 0)
+    count = len(given.points)
+    fit = _free_fit(given) if 3 * count > 2 * UNKNOWNS else None
+    if fit is None:
+        return None
+    size = fit.scales * given.spacing
+    state = (
+        "state their unit (jaxcal import --pose-units) or, if it is mm, the size of a pixel "
+        "(--spacing; the depth scale of the image shows it)"
+    )
+    if size.max() > LARGE_PIXEL_MM:
+        return (
+            f"the poses' translations may not be in mm: the pixels come out as {_sizes(size)}, "
+            f"which hardly any image has; {state}"
+        )
+    pixel = np.sqrt(size.prod())
+    if pixel > SMALL_PIXEL_MM:
+        return None
+    origin, target = fit.reduced.origin_and_target(fit.x)
+    axes = fit.x.reshape(2, 3)
+    seen = given.points @ axes + origin
+    apart = np.einsum("nji,nj->ni", given.rotations, target - given.translations) - seen
+    within = np.linalg.norm(apart @ (axes / fit.scales[:, None]).T, axis=1)
+    # Of a circular normal distribution, in which this is the median distance.
+    error = np.median(within) / np.sqrt(2 * np.log(2)) * np.sqrt(3 * count / (3 * count - UNKNOWNS))
+    if (
+        (error > SMALL_ERROR_MM and pixel > TINY_PIXEL_MM)
+        or np.median(np.linalg.norm(seen, axis=1)) > NEAR_MARKER_MM
+        or np.median(np.linalg.norm(given.translations, axis=1)) > NEAR_TRACKER_MM
+    ):
+        return None
+    return (
+        f"the poses' translations may be in cm or inches: the pixels come out as {_sizes(size)} "
+        f"and the errors within the image as {error:.2g} mm, which few probes and trackers reach; "
+        f"{state}"
+    )
+
+
+def _another_unit(scales: Float[np.ndarray, " 2"]) -> bool:
+    """Whether both axes are too long, or both too short, by more than anybody misstates them."""
+    return bool((scales > STATED_TWICE).all() or (scales < 1 / STATED_TWICE).all())
+
+
+def _sizes(size: Float[np.ndarray, " 2"]) -> str:
+    return f"{size[0]:.3g} x {size[1]:.3g} mm"
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,9 @@ IMPLAUSIBLE_RMS_MM = 10.0
 """Residuals with a larger root mean square do not come from a target within the beam."""
 USUAL_PIXEL_MM = (0.02, 1.0)
 """Estimated pixel sizes outside this interval lead to a warning."""
+FARTHEST_MM = 800.0
+"""If the target is farther from the origin of the probe's frame, there is a warning. Instruments
+that are tracked at their handle are half a metre long."""
 STEADY = 1e-3
 """If the scaled KKT residual of a stopped alternation is larger, there is a warning."""
 WEAK_MM = 1.5
@@ -50,6 +53,7 @@ def warnings(result: Calibration) -> list[str]:
         *_weak_elevation(result),
         *_medium_warnings(result),
         *_unusual_pixels(result),
+        *_far_from_probe(result),
         *(f"noise model: {text}" for text in (misfits(result) if converged else [])),
         *(suspects_in_words(result) if converged else []),
         *_misfitting_images(result),
@@ -190,8 +194,11 @@ def _weak_direction(result: Calibration) -> list[str]:
 
 
 def _unusual_pixels(result: Calibration) -> list[str]:
-    """A warning about estimated pixel sizes that hardly any image has."""
-    if result.scale_mm_per_px is None or "scale" not in result.blocks:
+    """A warning about estimated pixel sizes that hardly any image has, or a unit in doubt."""
+    if result.doubtful_unit is not None:
+        return [result.doubtful_unit]
+    problem = result.problem
+    if result.scale_mm_per_px is None or problem is None or problem.spacing_known:
         return []
     lateral, axial = (float(size) for size in np.asarray(result.scale_mm_per_px))
     least, largest = USUAL_PIXEL_MM
@@ -200,6 +207,21 @@ def _unusual_pixels(result: Calibration) -> list[str]:
     return [
         f"pixels of {lateral:.3g} x {axial:.3g} mm are unusual for ultrasound ({least:g} to "
         f"{largest:g} mm): are the poses' translations in mm?"
+    ]
+
+
+def _far_from_probe(result: Calibration) -> list[str]:
+    """A warning about poses whose origin no probe has, as of wrongly composed transforms."""
+    if result.problem is None:
+        return []
+    positions = np.asarray(result.problem.poses)[np.asarray(result.mask) > 0, :3, 3]
+    apart = float(np.median(np.linalg.norm(positions - np.asarray(result.point), axis=1)))
+    if not apart > FARTHEST_MM:
+        return []
+    return [
+        f"the target is {apart / 1000:.2g} m from the origin of the probe's frame: are the poses "
+        "those of the probe's markers? With a tracked reference, a pose is the inverse pose of the "
+        "reference, times that of the probe, in this order"
     ]
 
 

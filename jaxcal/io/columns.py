@@ -14,8 +14,8 @@ from jaxcal import FormatError
 from jaxcal.data.poses import QuaternionOrder
 from jaxcal.runtime.messages import quoted
 
-LengthUnit = Literal["mm", "cm", "m"]
-LENGTHS_MM: dict[str, float] = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
+LengthUnit = Literal["mm", "cm", "m", "in"]
+LENGTHS_MM: dict[str, float] = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
 TIMES_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
 _NAMES = {
@@ -38,13 +38,14 @@ _NAMES = {
 }
 _ROLE = {name: role for role, names in _NAMES.items() for name in names}
 _UNIT = re.compile(
-    r"^(.*?)(?:\s*[\[(]\s*([^\])]*?)\s*[\])]|[_\s](mm|cm|m|px|pixels?|s|ms|us|ns))?$"
+    r"^(.*?)(?:\s*[\[(]\s*([^\])]*?)\s*[\])]|[_\s](mm|cm|m|in|px|pixels?|s|ms|us|ns))?$"
 )
 _CELL = re.compile(r"([a-z]*?)_?([0-4])[_,]?([0-4])")
 _NUMBERED = re.compile(r"([a-z]*?)_?(\d{1,2})")
 _SPELLINGS = {
     "mm": ("millimeter", "millimeters", "millimetre", "millimetres"),
     "cm": (),
+    "in": ("inch", "inches"),
     "m": ("meter", "meters", "metre", "metres"),
     "px": ("pixel", "pixels"),
     "s": ("sec", "seconds"),
@@ -265,5 +266,5 @@ def _length(columns: tuple[int, ...], names: list[str], units: list[str | None])
         raise FormatError(f"translations are in different units: {mixed}")
     unit = stated.pop() if stated else None
     if unit not in (None, *LENGTHS_MM):
-        raise FormatError(f"translations in {quoted(str(unit))} are not known: mm, cm or m")
+        raise FormatError(f"translations in {quoted(str(unit))} are not known: mm, cm, m or in")
     return None if unit is None else LENGTHS_MM[unit]

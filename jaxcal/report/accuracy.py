@@ -64,12 +64,13 @@ def accuracy_record(
         wanted: further image points for the error, in the images' own unit (px or mm).
 
     Returns:
-        Arrays and plain values; all of them None where the calibration must not be used.
+        Arrays and plain values; all of them None where the calibration must not be used, or where
+        its lengths may not be in mm.
     """
     nothing = {"tre": None, "limits": None, "influence": None, "comparison": None}
     answer = result.numpy()
     determined = np.isfinite(answer.unknowns_covariance).all() and bool(result.converged)
-    if not determined or result.wrong_frames is not None:
+    if not determined or result.wrong_frames is not None or result.doubtful_unit is not None:
         return nothing
     region = region_of(answer, recording)
     grid = region.grid()[:, [0, 2]]

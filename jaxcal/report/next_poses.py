@@ -36,7 +36,7 @@ def next_poses_record(
         ``fills_space`` and ``tre_mm``, the error with this pose and those before it.
     """
     wrong = result.status == "failed" or result.wrong_frames is not None
-    if wrong or NOT_PLANNED in result.blocks:
+    if wrong or result.doubtful_unit is not None or NOT_PLANNED in result.blocks:
         return None
     try:
         candidates = design.candidates_around(

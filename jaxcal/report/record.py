@@ -65,6 +65,8 @@ CONVENTION = {
     "Eq. 7's minimum is at most gap_mm2 lower; null where no proof is tried",
     "wrong_frames": "what is wrong with the data's frames or units, in words: the calibration is "
     "not to be used; null where nothing seems wrong",
+    "doubtful_unit": "why the poses may be in another unit than mm, in words: all lengths may be "
+    "in that unit, and the error is not known; null where nothing speaks for it",
     "test_residual_mm": "of every test image, from its point to the mean of all: lateral, "
     "elevational, axial; null where it is not used",
     "date": "when the calibration was written: ISO 8601, UTC; not in the record of a calibration "
@@ -156,6 +158,7 @@ def calibration_record(
         "scaled_kkt_residual": answer.stationarity,
         "robust": result.robust,
         "wrong_frames": None if result.status == "failed" else result.wrong_frames,
+        "doubtful_unit": None if result.status == "failed" else result.doubtful_unit,
         "noise_model": noise_model(answer),
         "outliers": outliers(answer),
         "outlier_reasons": outlier_reasons(answer),

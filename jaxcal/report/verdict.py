@@ -86,6 +86,8 @@ def headline(record: dict[str, Any]) -> str:
         return "Do not use: these images do not determine the calibration."
     if status == "max_iterations":
         return "Do not trust: the solver stopped before it converged."
+    if told := record.get("doubtful_unit"):
+        return f"Uncertain: {_ended(told)}"
     if tre is None or tre.get("rms_mm") is None:
         return (
             f"Uncertain: solved from {record['images_used']} images, which do not show how large "
@@ -367,7 +369,7 @@ def advice(record: dict[str, Any]) -> list[str]:
             "Leave out images in which the target was picked wrongly (they have the largest "
             "residuals), or add images; then calibrate again."
         )
-    elif few or record["verdict"] == "uncertain":
+    elif not record.get("doubtful_unit") and (few or record["verdict"] == "uncertain"):
         advice.append(_addition(record))
     if status == "converged" and record["method"] == "conventional" and _out_of_plane(record):
         advice.append(

@@ -417,6 +417,23 @@ class Calibration:
             return None
         return wrong_frames(replace(self.problem, mask=self.mask), self.blocks)
 
+    @cached_property
+    def doubtful_unit(self) -> str | None:
+        """Why the poses may be in another unit than mm, in words, and what to do (one problem).
+
+        None where nothing speaks for it. If there is a text, the error to expect is not known.
+
+        Raises:
+            CalibrationError: under a JAX transformation.
+            InputError: of a batch.
+        """
+        from jaxcal.diagnostics.frame_checks import doubtful_unit
+
+        check_one(self._concrete(self.status_code))
+        if self.problem is None or self.wrong_frames is not None:
+            return None
+        return doubtful_unit(replace(self.problem, mask=self.mask))
+
     @property
     def warnings(self) -> list[str]:
         """What a person should know before using this answer, in words (one problem)."""
