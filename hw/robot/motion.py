@@ -55,6 +55,7 @@ _TICK_S = 0.02
 _START_PATIENCE_S, _START_TICK_S = 30.0, 0.1
 # The controller's watchdog has stopped the robot long before; a busy machine gets time to answer.
 _HANGS_WALL_S = 2.0
+_ENDING_WALL_S = 3.0
 _NO_ANSWER = (
     "the controller does not answer, its own watchdog stops the robot. Motion needs a new "
     "confirmation"
@@ -374,9 +375,10 @@ class Motion:
         self._ended = self._ended or error
         assert self._process is not None
         self._process.kill()
-        finish(self._process, None)
+        finish(self._process, _ENDING_WALL_S)
         if self._thread is not None and self._thread is not threading.current_thread():
-            self._thread.join()
+            # It may wait for a log that hangs, as where the disk does.
+            self._thread.join(_ENDING_WALL_S)
 
     def _send(self, message: dict) -> None:
         with self._sending:

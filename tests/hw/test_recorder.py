@@ -302,11 +302,14 @@ def test_what_finds_no_room_is_dropped_and_counted_but_no_image_is(tmp_path):
 
 
 def test_a_disk_that_does_not_answer_or_is_full_is_one_line(tmp_path):
-    with Recorder(tmp_path / "slow.h5", HEADER, patience_s=0.3) as recorder:
-        os.kill(recorder._process.pid, signal.SIGSTOP)
-        with pytest.raises(jaxcal.OutputError, match="did not confirm"):
-            recorder.sync()
-        os.kill(recorder._process.pid, signal.SIGCONT)
+    recorder = Recorder(tmp_path / "slow.h5", HEADER, patience_s=0.3)
+    os.kill(recorder._process.pid, signal.SIGSTOP)
+    with pytest.raises(jaxcal.OutputError, match=r"took no data for 0\.3 s: check it"):
+        recorder.sync()
+    os.kill(recorder._process.pid, signal.SIGCONT)
+    with pytest.raises(jaxcal.OutputError, match=r"took no data for 0\.3 s: check it"):
+        recorder.close()
+    RecordingWriter.resume(tmp_path / "slow.h5").close()
 
     path, recording = tmp_path / "full.h5", simulated()
     recorder = Recorder(path, HEADER)
@@ -374,6 +377,23 @@ def test_a_writer_that_takes_no_data_does_not_hold_the_end_up(tmp_path, monkeypa
     monkeypatch.undo()
     with Recorder(path) as again:
         assert again.rows["calibration"] == 1
+
+
+def test_a_disk_that_hangs_is_given_up_once(tmp_path, monkeypatch):
+    """Each event waited anew, the end as well; then the writer was blamed, and not the disk."""
+    recorder = Recorder(tmp_path / "rec.h5", HEADER, queue_bytes=2**16, patience_s=0.3)
+    for name in ("_ENDING_S", "_HUNG_ENDING_S"):
+        monkeypatch.setattr(f"hw.recording.recorder.{name}", 0.1)
+    os.kill(recorder._process.pid, signal.SIGSTOP)
+    large = [SimpleNamespace(**{**vars(frames(0, 1)[0]), "array": np.zeros((512, 512), np.uint8)})]
+    recorder.add_images(large * 8)
+    began = time.monotonic()
+    for _ in range(20):
+        with pytest.raises(jaxcal.OutputError, match="the disk took no data"):
+            recorder.add_event("command", "moveL", 1.0)
+    with pytest.raises(jaxcal.OutputError, match="the disk took no data"):
+        recorder.close()
+    assert time.monotonic() - began < 3.0
 
 
 def test_files_that_are_not_resumed(tmp_path):
