@@ -102,8 +102,7 @@ class RecordingWriter:
             with h5py.File(image, "w") as file:
                 _write_skeleton(file, header)
             temporary.write_bytes(image.getvalue())
-            # Not os.replace: somebody may have made the file in the meantime.
-            os.link(temporary, final)
+            _take_name(temporary, final)
         except FileExistsError:
             raise _existing(final) from None
         except OSError as error:
@@ -356,7 +355,7 @@ class RecordingWriter:
             final = self.path
             while True:
                 try:
-                    os.link(temporary, final)
+                    _take_name(temporary, final)
                     return final
                 except FileExistsError:
                     name = f"{self.path.stem}.{secrets.token_hex(4)}{self.path.suffix}"
@@ -397,6 +396,23 @@ class RecordingWriter:
             sizes = {"height": shape[1], "width": shape[2], "frame": dtype.name}
             _make_columns(target, LAYOUT["us"], sizes)
         return _columns(self._file, name)
+
+
+def _take_name(temporary: Path, final: Path) -> None:
+    """Give a file a name that nothing has: somebody may have made such a file in the meantime.
+
+    Raises:
+        FileExistsError: something has it.
+    """
+    try:
+        os.link(temporary, final)
+    except FileExistsError:
+        raise
+    except OSError:
+        # A USB stick (exFAT) or a shared folder may have no hard links.
+        with open(final, "xb"):
+            pass
+        os.replace(temporary, final)
 
 
 def _sidecar(path: Path) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import resource
@@ -465,6 +466,24 @@ def test_a_recording_that_a_reader_holds_open_is_not_said_to_be_written(tmp_path
         pytest.raises(jaxcal.OutputError, match="is open in another program: close it there"),
     ):
         Recorder(path)
+
+
+def test_a_folder_without_hard_links_takes_recordings(tmp_path, monkeypatch):
+    """As on a USB stick with exFAT: no recording could be made there."""
+
+    def refuse(*_: object) -> None:
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(os, "link", refuse)
+    path = tmp_path / "rec.h5"
+    RecordingWriter.create(path, HEADER).close()
+    with pytest.raises(jaxcal.OutputError, match="exists already: resume it"):
+        RecordingWriter.create(path, HEADER)
+    assert list(tmp_path.iterdir()) == [path]
+    writer = RecordingWriter.resume(path)
+    path.unlink()
+    assert writer.rescue() == path
+    assert check_resumable(path) is False
 
 
 def test_rows_fit_the_layout_or_are_refused_whole(tmp_path):
