@@ -468,6 +468,44 @@ def test_a_recording_that_a_reader_holds_open_is_not_said_to_be_written(tmp_path
         Recorder(path)
 
 
+@pytest.mark.parametrize("seed", [2, 4])
+def test_what_a_power_cut_leaves_is_resumed(tmp_path, seed):
+    """Some pages written since the last image are on the disk: HDF5's structures are torn.
+
+    Such a file was refused, with all images in it.
+    """
+    path, recording = tmp_path / "rec.h5", simulated(4)
+    writer = RecordingWriter.create(path, HEADER)
+
+    def note(start: int, stop: int) -> None:
+        count = stop - start
+        text = dict.fromkeys(("utc", "kind", "text"), np.full(count, b"moveL"))
+        writer.append("events", {"t_host": np.arange(start, stop, dtype=float), **text})
+
+    note(0, 200)
+    ones = dict.fromkeys(("max_elevation", "amplitude", "mask", "time", "target"), np.ones(4))
+    images = {"pose": recording.poses, "time_of_flight": recording.times}
+    writer.append("calibration", {**images, **ones})
+    writer.flush(durable=True)
+    before = path.read_bytes()
+    note(200, 400)
+    writer.flush()
+    after = path.read_bytes()
+    writer.close()
+    old = np.frombuffer(before.ljust(len(after), b"\0")[: len(after)], np.uint8)
+    written = np.repeat(np.random.default_rng(seed).random(len(after) // 4096 + 1) < 0.5, 4096)
+    path.write_bytes(np.where(written[: len(after)], np.frombuffer(after, np.uint8), old).tobytes())
+
+    RecordingWriter.resume(path).close()
+    with h5py.File(path) as file:
+        for name, values in images.items():
+            np.testing.assert_array_equal(file["calibration"][name], values)
+        np.testing.assert_array_equal(file["events/t_host"][:200], np.arange(200.0))
+        assert b"salvaged" in file["events/kind"][:]
+    assert {each.name for each in tmp_path.iterdir()} == {"rec.h5", "rec.h5.damaged"}
+    RecordingWriter.resume(path).finish()
+
+
 def test_a_folder_without_hard_links_takes_recordings(tmp_path, monkeypatch):
     """As on a USB stick with exFAT: no recording could be made there."""
 
