@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import re
@@ -402,7 +403,7 @@ def test_ctrl_c_at_a_terminal(tmp_path, tracked):
         assert "Traceback" not in person.shown
 
 
-def test_ctrl_c_while_a_complete_recording_is_calibrated(tmp_path):
+def test_ctrl_c_while_a_complete_recording_is_calibrated(tmp_path, monkeypatch):
     """It said "interrupted" and nothing else, as if the images were lost."""
     path = tmp_path / "rec.h5"
     poses, pixels = holds(6, 1)
@@ -411,18 +412,15 @@ def test_ctrl_c_while_a_complete_recording_is_calibrated(tmp_path):
             recorder.add_pixel(pose, pixel, np.eye(2), 1.0)
         recorder.finish()
 
-    def interrupt() -> None:
-        opened: set[str] = set()
-        while str(path) not in opened:
-            with suppress(OSError):
-                opened = {os.readlink(link) for link in Path("/proc/self/fd").iterdir()}
-        os.kill(os.getpid(), signal.SIGINT)
+    class Interrupting(io.StringIO):
+        def write(self, text: str) -> int:
+            os.kill(os.getpid(), signal.SIGINT)
+            return super().write(text)
 
-    words = rf"the recording is complete, calibrate it with: jaxcal calibrate {path}"
-    with as_interrupts():
-        threading.Thread(target=interrupt, daemon=True).start()
-        with pytest.raises(KeyboardInterrupt, match=words):
-            calibrate_and_print(str(path))
+    monkeypatch.setattr("sys.stdout", Interrupting())
+    words = rf"the recording is complete, calibrate it with: jaxcal calibrate {path} --estimate"
+    with as_interrupts(), pytest.raises(KeyboardInterrupt, match=words):
+        calibrate_and_print(str(path))
 
 
 @pytest.mark.parametrize(
