@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 import h5py
 import numpy as np
 
+from jaxcal.runtime.messages import command_line
+
 if TYPE_CHECKING:
     from hw.acquisition.acquire import Outcome
 
@@ -20,7 +22,20 @@ def calibrate_and_print(path: str, *lines: str) -> dict[str, Any]:
 
     Returns:
         The calibration's record (:func:`jaxcal.report.record.calibration_record`).
+
+    Raises:
+        KeyboardInterrupt: interrupted; its text says that the recording is complete.
     """
+    hint: list[str] = []
+    try:
+        return _calibrated(path, lines, hint)
+    except KeyboardInterrupt:
+        again = command_line(["jaxcal", "calibrate", path, *hint])
+        text = f"interrupted; the recording is complete, calibrate it with: {again}"
+        raise KeyboardInterrupt(text) from None
+
+
+def _calibrated(path: str, lines: tuple[str, ...], hint: list[str]) -> dict[str, Any]:
     from jaxcal.calibration.calibrate import calibrate
     from jaxcal.cli.common import Verbatim, print_page, segmented
     from jaxcal.io.given_files import naming
@@ -28,16 +43,15 @@ def calibrate_and_print(path: str, *lines: str) -> dict[str, Any]:
     from jaxcal.report.record import calibration_record
     from jaxcal.report.tables import calibration_table
     from jaxcal.report.verdict import verdict
-    from jaxcal.runtime.messages import command_line
 
     recording, notes = segmented(load(path))
     images = recording.calibration
     scale = ("scale",) if images.kind == "pixel" and images.spacing_mm is None else ()
+    hint += ["--estimate", "scale"] if scale else []
     with naming(path):
         result = calibrate(recording, estimate=scale)
     record = calibration_record(result, recording)
     record["warnings"] += notes
-    hint = ["--estimate", "scale"] if scale else []
     again = command_line(["jaxcal", "calibrate", path, *hint, "--report", "report.html"])
     last = (f"{path}: again, with a report:", Verbatim(f"  {again}"))
     print_page(calibration_table(record), *verdict(record), "", *lines, *last)

@@ -61,7 +61,7 @@ def check_resumable(path: str | os.PathLike[str]) -> bool:
             raise FormatError("is not a recording of this version")
         complete = flag(root, "complete")
         if complete is not False and not _lacks_images(root):
-            raise FormatError("is complete: there is nothing to resume")
+            raise FormatError("is complete: there is nothing to resume; jaxcal calibrate reads it")
         for name, columns in LAYOUT.items():
             node = _existing(root, name)
             for key, column in columns.items():

@@ -36,6 +36,7 @@ from hw.recording.layout import (
     LAYOUT,
     SELECTED,
     STATIC,
+    TEXT_BYTES,
     VERSION,
     Column,
     RecordingHeader,
@@ -52,6 +53,9 @@ _STRUCTURES_BYTES = 2**21
 
 _STEP_BYTES = 2**23
 """Bytes allocated ahead, so that not every row asks the file system."""
+
+_LARGEST_ARRAY = 2**28
+"""Bytes; an array of /plan, /test or /truth has far fewer."""
 
 _END_OF_FILE = slice(40, 48)
 """Where a superblock of version 0 keeps the file's length, little endian."""
@@ -102,8 +106,7 @@ class RecordingWriter:
             with h5py.File(image, "w") as file:
                 _write_skeleton(file, header)
             temporary.write_bytes(image.getvalue())
-            # Not os.replace: somebody may have made the file in the meantime.
-            os.link(temporary, final)
+            _take_name(temporary, final)
         except FileExistsError:
             raise _existing(final) from None
         except OSError as error:
@@ -115,7 +118,10 @@ class RecordingWriter:
 
     @classmethod
     def resume(cls, path: str | os.PathLike[str]) -> RecordingWriter:
-        """Go on with a recording whose writer ended early, cut back to its last whole rows.
+        """Go on with a recording whose writer ended early, as far as it is whole.
+
+        After a power cut some pages of the file may be older than others. Then what is whole is
+        copied into a new file of this name, and the damaged one is kept as ``<file>.damaged``.
 
         Raises:
             FormatError: not a recording of an acquisition, damaged, or complete already.
@@ -125,20 +131,21 @@ class RecordingWriter:
         length = stored_length(path)
         if length is not None:
             os.truncate(path, length)
+        damaged = _salvaged(Path(path))
         file = _open_for_writing(Path(path))
-        try:
-            for name in LAYOUT:
-                _cut_back(list(_columns(file, name).values()))
-        except FormatError:
-            file.close()
-            raise
-        except Exception as error:
-            file.close()
-            raise FormatError(f"{path}: is truncated or damaged: {one_line(error)}") from None
         # It may have come to its end without all images: its digest no longer holds.
         file.attrs["complete"] = False
         _sidecar(Path(path)).unlink(missing_ok=True)
-        return cls(Path(path), file)
+        writer = cls(Path(path), file)
+        if damaged is not None:
+            writer.note("salvaged", f"what was whole; the damaged file is {damaged.name}")
+        return writer
+
+    def note(self, kind: str, text: str) -> None:
+        """Append an event without a host time."""
+        said = text.encode(errors="backslashreplace")[:TEXT_BYTES]
+        row = {"t_host": np.nan, "utc": utc_now().encode(), "kind": kind.encode(), "text": said}
+        self.append("events", {key: np.array([value]) for key, value in row.items()})
 
     def append(self, name: str, columns: Mapping[str, np.ndarray]) -> None:
         """Append rows to a group.
@@ -356,7 +363,7 @@ class RecordingWriter:
             final = self.path
             while True:
                 try:
-                    os.link(temporary, final)
+                    _take_name(temporary, final)
                     return final
                 except FileExistsError:
                     name = f"{self.path.stem}.{secrets.token_hex(4)}{self.path.suffix}"
@@ -397,6 +404,23 @@ class RecordingWriter:
             sizes = {"height": shape[1], "width": shape[2], "frame": dtype.name}
             _make_columns(target, LAYOUT["us"], sizes)
         return _columns(self._file, name)
+
+
+def _take_name(temporary: Path, final: Path) -> None:
+    """Give a file a name that nothing has: somebody may have made such a file in the meantime.
+
+    Raises:
+        FileExistsError: something has it.
+    """
+    try:
+        os.link(temporary, final)
+    except FileExistsError:
+        raise
+    except OSError:
+        # A USB stick (exFAT) or a shared folder may have no hard links.
+        with open(final, "xb"):
+            pass
+        os.replace(temporary, final)
 
 
 def _sidecar(path: Path) -> Path:
@@ -502,25 +526,109 @@ def _columns(file: h5py.File, name: str) -> dict[str, h5py.Dataset]:
     return {key: member for key, member in found.items() if isinstance(member, h5py.Dataset)}
 
 
-def _cut_back(datasets: list[h5py.Dataset]) -> None:
-    """Drop the last rows if not every column has them, or if they cannot be read."""
-    if not datasets:
-        return
-    rows = whole = min(len(dataset) for dataset in datasets)
-    for dataset in datasets:
-        step = (dataset.chunks or (1,))[0]
-        start = max(0, (rows - 1) // step * step - step)
-        while start < whole:
-            stop = min(start + step, whole)
-            try:
-                dataset[start:stop]
-            except OSError:
-                whole = start
-                break
-            start = stop
-    for dataset in datasets:
-        if len(dataset) != whole:
-            dataset.resize(whole, axis=0)
+def _salvaged(path: Path) -> Path | None:
+    """Replace a recording that is not whole by a copy of what is; where the damaged one is then.
+
+    HDF5 cannot be asked to cut such a file back: it would follow the structures that are damaged.
+
+    Raises:
+        FormatError: what every recording has cannot be read.
+        OutputError: it is open elsewhere, or the disk refused the copy.
+    """
+    final = Path(os.path.realpath(path))
+    temporary = final.parent / f".partial-{secrets.token_hex(8)}{final.suffix}"
+    kept = final.with_name(f"{final.name}.damaged")
+    if kept.exists():
+        kept = final.with_name(f"{final.name}.{secrets.token_hex(4)}.damaged")
+    try:
+        with h5py.File(final, "r") as file:
+            if all(_is_whole(_columns(file, name)) for name in LAYOUT):
+                return None
+            with h5py.File(temporary, "w") as copy:
+                _copy_whole(file, copy)
+        shutil.copymode(final, temporary)
+        with open(temporary, "rb+") as written:
+            os.fsync(written.fileno())
+        _take_name(final, kept)
+        os.replace(temporary, final)
+        return kept
+    except BlockingIOError:
+        raise OutputError(f"{path}: is open in another program: close it there") from None
+    except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS):
+            raise OutputError(f"{path}: cannot be copied: {one_line(error)}") from None
+        raise FormatError(f"{path}: is truncated or damaged: {one_line(error)}") from None
+    except Exception as error:
+        raise FormatError(f"{path}: is truncated or damaged: {one_line(error)}") from None
+    finally:
+        with suppress(OSError):
+            temporary.unlink()
+
+
+def _is_whole(columns: Mapping[str, h5py.Dataset]) -> bool:
+    """Whether all columns have as many rows, every chunk is there, and the last can be read."""
+    if len({len(column) for column in columns.values()}) > 1:
+        return False
+    try:
+        for column in columns.values():
+            step = _step(column)
+            starts = range(0, len(column), step)
+            if column.id.get_num_chunks() != len(starts):
+                return False
+            for start in starts[-2:]:
+                column[start : start + step]
+    except (OSError, RuntimeError, ValueError):
+        return False
+    return True
+
+
+def _copy_whole(file: h5py.File, copy: h5py.File) -> None:
+    """Copy attributes and arrays, and the leading rows that every column of a group has whole."""
+    copy.attrs.update(file.attrs)
+    for name in ("probe", *STATIC, *LAYOUT):
+        if name not in file:
+            continue
+        source, target = file.require_group(name), copy.require_group(name)
+        target.attrs.update(source.attrs)
+        if name not in LAYOUT:
+            for key, member in source.items():
+                if member.nbytes > _LARGEST_ARRAY:
+                    raise ValueError(f"{member.name} claims {member.nbytes} bytes")
+                target.create_dataset(key, data=member[()]).attrs.update(member.attrs)
+            continue
+        columns = _columns(file, name)
+        rows = min((_whole_rows(column) for column in columns.values()), default=0)
+        for key, column in columns.items():
+            made = target.create_dataset(
+                key,
+                shape=(rows, *column.shape[1:]),
+                maxshape=column.maxshape,
+                dtype=column.dtype,
+                chunks=column.chunks,
+                fletcher32=True,
+            )
+            made.attrs["units"] = LAYOUT[name][key].unit
+            step = _step(column)
+            for start in range(0, rows, step):
+                stop = min(start + step, rows)
+                made[start:stop] = column[start:stop]
+
+
+def _step(column: h5py.Dataset) -> int:
+    return (column.chunks or (1,))[0]
+
+
+def _whole_rows(column: h5py.Dataset) -> int:
+    """How many leading rows are in the file, and can be read."""
+    step, tail = _step(column), (0,) * (column.ndim - 1)
+    for start in range(0, len(column), step):
+        try:
+            # Rows of a chunk that is not in the file would be read as zeros.
+            column.id.read_direct_chunk((start, *tail))
+            column[start : start + step]
+        except (OSError, RuntimeError, ValueError):
+            return start
+    return len(column)
 
 
 def _fitting(name: str, key: str, values: np.ndarray, dataset: h5py.Dataset) -> np.ndarray:

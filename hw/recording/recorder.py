@@ -18,7 +18,7 @@ import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO, NoReturn
 
 import numpy as np
 
@@ -40,6 +40,8 @@ QUEUE_BYTES = 2**26
 
 _PATIENCE_S = 30.0
 _ENDING_S = 30.0
+_HUNG_ENDING_S = 3.0
+"""The same after the disk has taken nothing for so long that it was given up."""
 
 
 class Recorder:
@@ -80,7 +82,7 @@ class Recorder:
         """The first error of the writer; None as long as it writes."""
         self.kept = self.path
         """Where the rows are: maybe another path, if the file was moved, removed or replaced."""
-        self._ending = self._ended = self._closed = False
+        self._ending = self._ended = self._closed = self._hung = False
         self._marks = 0
         # In a session of its own: Ctrl-C, or a signal to the whole group, must not stop the writer.
         self._process = spawn("hw.recording.writer_process", self.path, stdin=True, stderr=None)
@@ -360,9 +362,7 @@ class Recorder:
                 if not wait:
                     return False
                 if not self._changed.wait(deadline - time.monotonic()):
-                    raise OutputError(
-                        f"{self.path}: the disk took no data for {self._patience:g} s"
-                    )
+                    self._give_up(self._patience)
             self._raise_error()
             self._queue.append(data)
             self._waiting += size
@@ -376,10 +376,20 @@ class Recorder:
             while mark not in self._answers:
                 self._raise_error()
                 if not self._changed.wait(deadline - time.monotonic()):
-                    raise OutputError(
-                        f"{self.path}: the disk did not confirm within {patience:g} s"
-                    )
+                    self._give_up(patience)
             return self._answers.pop(mark)
+
+    def _give_up(self, waited_s: float) -> NoReturn:
+        """Fail for good: whatever is handed over next would wait as long."""
+        self._hung = True
+        self._fail(
+            OutputError(
+                f"{self.path}: the disk took no data for {waited_s:g} s: check it, and the network "
+                "if it is reached through one"
+            )
+        )
+        assert self.error is not None
+        raise self.error
 
     def _raise_error(self) -> None:
         if self.error is not None:
@@ -392,18 +402,20 @@ class Recorder:
         with self._changed:
             self._ending = self._ended = True
             self._changed.notify_all()
-        self._feeder.join(_ENDING_S)
+        ending_s = _HUNG_ENDING_S if self._hung else _ENDING_S
+        self._feeder.join(ending_s)
         stuck = self._feeder.is_alive()
         if stuck:
             # It takes no data. To close its pipe here would wait for the feeder, without end, or be
             # done by both at once. The feeder closes it when the writer's end has broken it.
             self._process.kill()
-            self._feeder.join(_ENDING_S)
-        ended = not self._feeder.is_alive() and finish(self._process, _ENDING_S)
+            self._feeder.join(ending_s)
+        ended = not self._feeder.is_alive() and finish(self._process, ending_s)
         if stuck or not ended:
             self._fail(OutputError(f"{self.path}: the writer did not end and was stopped"))
-        self._listener.join(_ENDING_S)
-        if self._process.stdout is not None:
+        self._listener.join(ending_s)
+        # A writer that hangs in the disk outlives its kill, and the listener then waits for it.
+        if self._process.stdout is not None and not self._listener.is_alive():
             self._process.stdout.close()
         self._closed = True
 

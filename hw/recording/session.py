@@ -24,6 +24,7 @@ import numpy as np
 from hw.active_echo.device import SILENT, ActiveEcho, EchoFrame, EchoStatistics, median_of
 from hw.recording.recorder import Recorder
 from hw.robot.stream import PoseSample, PoseStream
+from hw.runtime.clock import Waiting
 from hw.runtime.errors import DeviceError, StaleError
 from hw.runtime.rigid import apart
 from hw.setup.description import Setup
@@ -143,7 +144,8 @@ class Session:
             self._measure_echo_delay()
             self._devices = opened.pop_all()
         self._counts = self.echo.statistics()
-        self._echo_seen = self._image_seen = self.clock.now()
+        self._echo_seen = self._image_seen = self._emptied = self.clock.now()
+        self._held_up_until = -math.inf
         self._thread = threading.Thread(target=self._pump, daemon=True, name="session")
         self._thread.start()
 
@@ -187,9 +189,14 @@ class Session:
             DeviceError: trouble of a device.
             OutputError: an error of the recorder.
         """
-        error = self._trouble()
-        if error is not None:
-            raise error
+        grace = self.clock.patience(self.watch.grace_s)
+        waiting = Waiting(self.clock)
+        while (error := self._trouble()) is not None:
+            # What came while this process was suspended may still be unread.
+            unread = self._held_up_s() or self.clock.now() < self._held_up_until + grace
+            if not (unread and isinstance(error, StaleError)) or waiting.so_far() > grace:
+                raise error
+            time.sleep(_PERIOD_WALL_S)
 
     def wait_until_clear(self) -> None:
         """Wait for the end of a hesitation; returns at once where there is none.
@@ -223,6 +230,10 @@ class Session:
         with self._changed:
             if self._failure is not None:
                 return self._failure
+            held_up = self._held_up_s()
+            if held_up:
+                text = f"this program was suspended or held up for {held_up:.2f} s"
+                return StaleError(text, device="robot")
             now, watch = self.clock.now(), self.watch
             # Where no good frame has come since, what came instead is the reason, however long ago.
             window = now - min(now - watch.burst_s, self._echo_seen)
@@ -258,6 +269,11 @@ class Session:
             return error
         return None
 
+    def _held_up_s(self) -> float:
+        """How long no queue of a device was emptied, bench s; 0 where that is as usual."""
+        silent = self.clock.now() - self._emptied
+        return silent if silent > self.clock.patience(self.watch.echo_age_s) else 0.0
+
     def _is_late(self) -> bool:
         """Whether the newest echo frame may have come too late."""
         late = self._echo_frames[-1].late_s if self._echo_frames else 0.0
@@ -285,6 +301,7 @@ class Session:
                 text = f"{problem}: times of flight may be wrong"
                 raise DeviceError(text, device="active echo")
         found: list[EchoFrame] = []
+        waiting = Waiting(self.clock)
         with self._changed:
             while True:
                 period = frame_period(list(self._echo_frames), self._clock_hz)
@@ -297,7 +314,7 @@ class Session:
                 if self._failure is not None:
                     raise self._failure
                 late = 2 * frames * (period or 0.0) + self.clock.patience(self.watch.grace_s)
-                if self.clock.now() > began + late:
+                if waiting.so_far() > late:
                     break
                 self._changed.wait(self.clock.wall(0.1))
         self.check()
@@ -318,7 +335,9 @@ class Session:
         Raises:
             DeviceError: trouble while waiting.
         """
-        deadline = self.clock.now() + self.clock.patience(self.watch.grace_s)
+        grace = self.watch.grace_s
+        longest = max(self.clock.patience(grace), since - self.clock.now() + grace)
+        waiting = Waiting(self.clock)
         with self._changed:
             while True:
                 image = self._image
@@ -326,7 +345,7 @@ class Session:
                     return image
                 if self._failure is not None:
                     raise self._failure
-                if self.clock.now() > max(deadline, since + self.watch.grace_s):
+                if waiting.so_far() > longest:
                     break
                 self._changed.wait(self.clock.wall(0.1))
         self.check()
@@ -373,6 +392,11 @@ class Session:
                 more = getattr(counts, what) - getattr(self._counts, what)
                 self._bad.extend((now, text) for _ in range(min(more, 16)))
             self._counts = counts
+            if self._held_up_s():
+                # Frames of that time are still on their way through this process.
+                self._echo_seen = self._image_seen = now
+                self._held_up_until = now
+            self._emptied = now
             if frames:
                 self._echo_frames.extend(frames)
                 self._echo_seen = frames[-1].t_host

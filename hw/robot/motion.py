@@ -40,7 +40,7 @@ from hw.robot.motion_plan import MotionPlan
 from hw.robot.mover.messages import Setup, error_of, line_of, sample_of, told
 from hw.robot.path_checks import check_plan
 from hw.robot.stream import PoseSample
-from hw.runtime.clock import REAL, Clock
+from hw.runtime.clock import HELD_UP_WALL_S, REAL, Clock
 from hw.runtime.errors import DeviceError, LostError, StaleError, StoppedError, refused
 from hw.runtime.interrupts import heed_interrupt
 from hw.runtime.processes import finish, spawn
@@ -55,7 +55,7 @@ _TICK_S = 0.02
 _START_PATIENCE_S, _START_TICK_S = 30.0, 0.1
 # The controller's watchdog has stopped the robot long before; a busy machine gets time to answer.
 _HANGS_WALL_S = 2.0
-_HELD_UP_WALL_S = 0.5
+_ENDING_WALL_S = 3.0
 _NO_ANSWER = (
     "the controller does not answer, its own watchdog stops the robot. Motion needs a new "
     "confirmation"
@@ -264,7 +264,7 @@ class Motion:
                 answer = self._answers.get(timeout=tick)
             except queue.Empty:
                 answer = {}
-            if time.monotonic() - asked_s > tick + _HELD_UP_WALL_S:
+            if time.monotonic() - asked_s > tick + HELD_UP_WALL_S:
                 # This process was held up, not the other one: what that told is still unread.
                 self._heard = time.monotonic()
             error = error_of(answer)
@@ -375,9 +375,10 @@ class Motion:
         self._ended = self._ended or error
         assert self._process is not None
         self._process.kill()
-        finish(self._process, None)
+        finish(self._process, _ENDING_WALL_S)
         if self._thread is not None and self._thread is not threading.current_thread():
-            self._thread.join()
+            # It may wait for a log that hangs, as where the disk does.
+            self._thread.join(_ENDING_WALL_S)
 
     def _send(self, message: dict) -> None:
         with self._sending:

@@ -13,7 +13,6 @@ import math
 import pickle
 import subprocess
 import threading
-import time
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -24,13 +23,14 @@ import numpy as np
 
 from hw.robot.identity import Identity, read_identity
 from hw.robot.rtde import Packet, PendantSettings, too_late
-from hw.runtime.clock import REAL, Clock, Lag
+from hw.runtime.clock import REAL, Clock, Lag, Waiting
 from hw.runtime.errors import DeviceError, LostError, StaleError, refused
 from hw.runtime.processes import spawn
 from hw.runtime.rigid import mean_pose, pose_to_ur, ur_to_pose
 from jaxcal.runtime.array_types import Float
 
 _OFFSET_TOLERANCE = 1e-6
+_TURN_WALL_S = 0.1
 _MOST_POSES = 60_000
 """Most poses kept for :meth:`PoseStream.drain`; beyond it the oldest are dropped, and counted."""
 
@@ -217,12 +217,14 @@ class PoseStream:
         """
         start = self.clock.now()
         come: list[PoseSample] = []
-        give_up = time.monotonic() + self.clock.wall(seconds) + 1.0 + self.max_age_s
+        longest = seconds + self.clock.speed * (1.0 + self.max_age_s)
+        waiting = Waiting(self.clock)
         with self._condition:
             self._listeners.append(come)
             while not come or come[-1].t_host < start + seconds:
-                if self._error or not self._condition.wait(give_up - time.monotonic()):
+                if self._error or waiting.so_far() > longest:
                     break
+                self._condition.wait(_TURN_WALL_S)
             self._listeners = [other for other in self._listeners if other is not come]
             error = self._error
         self._check(error)

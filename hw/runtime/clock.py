@@ -13,6 +13,8 @@ from dataclasses import dataclass, field
 
 _MOST_DRIFT = 200e-6
 _MOST_AHEAD_S = 0.1
+HELD_UP_WALL_S = 0.5
+"""A thread that comes back so much later than it asked for was held up, or its process was."""
 
 
 def monotonic_s() -> float:
@@ -75,6 +77,24 @@ class Clock:
 
 REAL = Clock()
 """The clock of a real bench; its zero is the import of this module."""
+
+
+class Waiting:
+    """How long this process has waited, in turns that are shorter than half a second on the wall.
+
+    A longer turn counts as half a second: a process that was suspended (Ctrl-Z) or held up has not
+    waited meanwhile, and what came during that time is still unread.
+    """
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock, self._waited, self._last = clock, 0.0, time.monotonic()
+
+    def so_far(self) -> float:
+        """Bench seconds since the beginning; to be asked at every turn."""
+        now = time.monotonic()
+        self._waited += min(now - self._last, HELD_UP_WALL_S)
+        self._last = now
+        return self._waited * self._clock.speed
 
 
 class Lag:

@@ -11,6 +11,8 @@ from typing import IO
 
 from jaxcal.runtime.isolated import python_command
 
+_KILLED_WALL_S = 5.0
+
 
 def spawn(
     module: str,
@@ -40,12 +42,12 @@ def first_line(process: subprocess.Popen[bytes], patience_s: float) -> bytes:
     return process.stdout.readline() if ready else b""
 
 
-def finish(process: subprocess.Popen[bytes], patience_s: float | None) -> bool:
+def finish(process: subprocess.Popen[bytes], patience_s: float) -> bool:
     """Close a process's input, wait for its end, and kill it if that takes longer.
 
     Args:
         process: with or without an input.
-        patience_s: wall s; None: without end.
+        patience_s: wall s.
 
     Returns:
         Whether it ended by itself.
@@ -57,7 +59,9 @@ def finish(process: subprocess.Popen[bytes], patience_s: float | None) -> bool:
         process.wait(patience_s)
     except subprocess.TimeoutExpired:
         process.kill()
-        process.wait()
+        # One that hangs in a disk that does not answer ends only when that answers.
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(_KILLED_WALL_S)
         return False
     return True
 

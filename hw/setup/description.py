@@ -40,6 +40,10 @@ _WIDTH_MM = (2.0, 300.0)
 _HOUSING_MM = (25.0, 60.0)
 """Thickness and length of a housing where the setup gives none: those of a common linear probe."""
 _LONGEST_OFFSET_M = 1.0
+_LONGEST_SETTLE_S = 30.0
+"""Given in ms, the robot would rest for minutes at every pose."""
+_MOST_POSES_HZ = 1000.0
+"""Twice as many as a controller sends."""
 _TIP_TOLERANCE_MM = 0.1
 
 
@@ -312,9 +316,9 @@ def _robot(table: dict[str, Any]) -> dict[str, Any]:
     """What a setup takes of the robot's table, by the names that it has there."""
     check_host(table["host"], "[robot] host")
     robot = {{"host": "robot_host"}.get(key, key): value for key, value in table.items()}
-    for key in ("settle_s", "frequency_hz"):
-        if key in robot and not (np.isfinite(robot[key]) and robot[key] > 0):
-            raise InputError(f"[robot] {key} must be a positive number")
+    for key, most in {"settle_s": _LONGEST_SETTLE_S, "frequency_hz": _MOST_POSES_HZ}.items():
+        if key in robot and not 0 < robot[key] <= most:
+            raise InputError(f"[robot] {key} must be positive and at most {most:g}")
     if "tcp_offset" in robot:
         offset = _numbers("tcp_offset", robot["tcp_offset"], (6,), "robot")
         if np.linalg.norm(offset[:3]) > _LONGEST_OFFSET_M:

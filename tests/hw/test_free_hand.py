@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import json
+import os
 import re
+import signal
 import socket
 import subprocess
 import sys
@@ -29,14 +32,18 @@ from plus_server import (
 from scipy.spatial.transform import Rotation
 
 import jaxcal
+from hw.acquisition.outcome import calibrate_and_print
 from hw.cli.main import main
 from hw.freehand.acquire import acquire_free_hand
 from hw.freehand.guide import Guide, Rules, Taken, orientation_sds
 from hw.freehand.posed import PosedImage, PosedImages
 from hw.freehand.request import FreeHand, FreeHandStopped
+from hw.recording.layout import RecordingHeader
+from hw.recording.recorder import Recorder
 from hw.robot.identity import read_identity
 from hw.robot.rtde import PacketReader
 from hw.runtime.errors import DeviceError
+from hw.runtime.interrupts import as_interrupts
 from hw.ultrasound.receiver import Image, UltrasoundStream
 from jaxcal import FormatError, InputError
 from jaxcal.io.message_content import Picture, Tracked
@@ -394,6 +401,26 @@ def test_ctrl_c_at_a_terminal(tmp_path, tracked):
         assert person.shown.count("▀") > 1000
         assert "go on with: jaxcal-hw free-hand" in person.shown.replace("\r\n", " ")
         assert "Traceback" not in person.shown
+
+
+def test_ctrl_c_while_a_complete_recording_is_calibrated(tmp_path, monkeypatch):
+    """It said "interrupted" and nothing else, as if the images were lost."""
+    path = tmp_path / "rec.h5"
+    poses, pixels = holds(6, 1)
+    with Recorder(path, RecordingHeader("pixel", {}, 0)) as recorder:
+        for pose, pixel in zip(poses, pixels, strict=True):
+            recorder.add_pixel(pose, pixel, np.eye(2), 1.0)
+        recorder.finish()
+
+    class Interrupting(io.StringIO):
+        def write(self, text: str) -> int:
+            os.kill(os.getpid(), signal.SIGINT)
+            return super().write(text)
+
+    monkeypatch.setattr("sys.stdout", Interrupting())
+    words = rf"the recording is complete, calibrate it with: jaxcal calibrate {path} --estimate"
+    with as_interrupts(), pytest.raises(KeyboardInterrupt, match=words):
+        calibrate_and_print(str(path))
 
 
 @pytest.mark.parametrize(

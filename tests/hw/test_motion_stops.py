@@ -328,6 +328,29 @@ def test_a_log_that_fails_stops_the_robot():
     assert state["reason"] == "the client stopped the script"
 
 
+def test_a_log_that_hangs_does_not_hold_up_who_is_told_of_the_end(monkeypatch):
+    """As where the disk hangs: the end of the motion was told only once the log went on."""
+    for name in ("_HANGS_WALL_S", "_ENDING_WALL_S"):
+        monkeypatch.setattr(f"hw.robot.motion.{name}", 0.2)
+    hanging = threading.Event()
+
+    def log(t: float, command: str, numbers: dict[str, object]) -> None:
+        if command == "moveL":
+            hanging.wait(6.0)
+
+    with EmulatedRobot(version=CB_SERIES) as robot:
+        plan = replace(PLAN, serial=read_identity(robot.host).name)
+        given = confirm_unattended(plan, plan.digest, clock=robot.clock)
+        named = {"clock": robot.clock, "dry_run": False, "caller_s": 2.0}
+        with Motion(robot.host, plan, given, log=log, **named) as motion:
+            began = time.monotonic()
+            with pytest.raises(LostError, match="motion process does not respond"):
+                motion.move_to(PLAN.targets[2])
+            assert time.monotonic() - began < 3.0
+            assert robot.state()["velocity"] == [0.0] * 6
+            hanging.set()
+
+
 def test_an_interrupt_within_what_an_interrupt_did_is_kept():
     """Ctrl-C twice: the second came before the first had latched its stop."""
 

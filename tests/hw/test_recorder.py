@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import resource
@@ -302,11 +303,14 @@ def test_what_finds_no_room_is_dropped_and_counted_but_no_image_is(tmp_path):
 
 
 def test_a_disk_that_does_not_answer_or_is_full_is_one_line(tmp_path):
-    with Recorder(tmp_path / "slow.h5", HEADER, patience_s=0.3) as recorder:
-        os.kill(recorder._process.pid, signal.SIGSTOP)
-        with pytest.raises(jaxcal.OutputError, match="did not confirm"):
-            recorder.sync()
-        os.kill(recorder._process.pid, signal.SIGCONT)
+    recorder = Recorder(tmp_path / "slow.h5", HEADER, patience_s=0.3)
+    os.kill(recorder._process.pid, signal.SIGSTOP)
+    with pytest.raises(jaxcal.OutputError, match=r"took no data for 0\.3 s: check it"):
+        recorder.sync()
+    os.kill(recorder._process.pid, signal.SIGCONT)
+    with pytest.raises(jaxcal.OutputError, match=r"took no data for 0\.3 s: check it"):
+        recorder.close()
+    RecordingWriter.resume(tmp_path / "slow.h5").close()
 
     path, recording = tmp_path / "full.h5", simulated()
     recorder = Recorder(path, HEADER)
@@ -374,6 +378,23 @@ def test_a_writer_that_takes_no_data_does_not_hold_the_end_up(tmp_path, monkeypa
     monkeypatch.undo()
     with Recorder(path) as again:
         assert again.rows["calibration"] == 1
+
+
+def test_a_disk_that_hangs_is_given_up_once(tmp_path, monkeypatch):
+    """Each event waited anew, the end as well; then the writer was blamed, and not the disk."""
+    recorder = Recorder(tmp_path / "rec.h5", HEADER, queue_bytes=2**16, patience_s=0.3)
+    for name in ("_ENDING_S", "_HUNG_ENDING_S"):
+        monkeypatch.setattr(f"hw.recording.recorder.{name}", 0.1)
+    os.kill(recorder._process.pid, signal.SIGSTOP)
+    large = [SimpleNamespace(**{**vars(frames(0, 1)[0]), "array": np.zeros((512, 512), np.uint8)})]
+    recorder.add_images(large * 8)
+    began = time.monotonic()
+    for _ in range(20):
+        with pytest.raises(jaxcal.OutputError, match="the disk took no data"):
+            recorder.add_event("command", "moveL", 1.0)
+    with pytest.raises(jaxcal.OutputError, match="the disk took no data"):
+        recorder.close()
+    assert time.monotonic() - began < 3.0
 
 
 def test_files_that_are_not_resumed(tmp_path):
@@ -445,6 +466,62 @@ def test_a_recording_that_a_reader_holds_open_is_not_said_to_be_written(tmp_path
         pytest.raises(jaxcal.OutputError, match="is open in another program: close it there"),
     ):
         Recorder(path)
+
+
+@pytest.mark.parametrize("seed", [2, 4])
+def test_what_a_power_cut_leaves_is_resumed(tmp_path, seed):
+    """Some pages written since the last image are on the disk: HDF5's structures are torn.
+
+    Such a file was refused, with all images in it.
+    """
+    path, recording = tmp_path / "rec.h5", simulated(4)
+    writer = RecordingWriter.create(path, HEADER)
+
+    def note(start: int, stop: int) -> None:
+        count = stop - start
+        text = dict.fromkeys(("utc", "kind", "text"), np.full(count, b"moveL"))
+        writer.append("events", {"t_host": np.arange(start, stop, dtype=float), **text})
+
+    note(0, 200)
+    ones = dict.fromkeys(("max_elevation", "amplitude", "mask", "time", "target"), np.ones(4))
+    images = {"pose": recording.poses, "time_of_flight": recording.times}
+    writer.append("calibration", {**images, **ones})
+    writer.flush(durable=True)
+    before = path.read_bytes()
+    note(200, 400)
+    writer.flush()
+    after = path.read_bytes()
+    writer.close()
+    old = np.frombuffer(before.ljust(len(after), b"\0")[: len(after)], np.uint8)
+    written = np.repeat(np.random.default_rng(seed).random(len(after) // 4096 + 1) < 0.5, 4096)
+    path.write_bytes(np.where(written[: len(after)], np.frombuffer(after, np.uint8), old).tobytes())
+
+    RecordingWriter.resume(path).close()
+    with h5py.File(path) as file:
+        for name, values in images.items():
+            np.testing.assert_array_equal(file["calibration"][name], values)
+        np.testing.assert_array_equal(file["events/t_host"][:200], np.arange(200.0))
+        assert b"salvaged" in file["events/kind"][:]
+    assert {each.name for each in tmp_path.iterdir()} == {"rec.h5", "rec.h5.damaged"}
+    RecordingWriter.resume(path).finish()
+
+
+def test_a_folder_without_hard_links_takes_recordings(tmp_path, monkeypatch):
+    """As on a USB stick with exFAT: no recording could be made there."""
+
+    def refuse(*_: object) -> None:
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(os, "link", refuse)
+    path = tmp_path / "rec.h5"
+    RecordingWriter.create(path, HEADER).close()
+    with pytest.raises(jaxcal.OutputError, match="exists already: resume it"):
+        RecordingWriter.create(path, HEADER)
+    assert list(tmp_path.iterdir()) == [path]
+    writer = RecordingWriter.resume(path)
+    path.unlink()
+    assert writer.rescue() == path
+    assert check_resumable(path) is False
 
 
 def test_rows_fit_the_layout_or_are_refused_whole(tmp_path):

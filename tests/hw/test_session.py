@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import re
 import socket
+import subprocess
 import tempfile
 import threading
 import time
@@ -276,3 +278,25 @@ def test_a_pose_that_changes_at_rest_is_no_pose_of_an_image(tmp_path):
             robot.ask("tcp_offset", (0.0, 0.0, 0.102, 0.0, 0.0, 0.0))
             with pytest.raises(RefusedError, match="set the TCP offset as before"):
                 stage.resting_pose(0.1)
+
+
+@pytest.mark.real_time
+def test_a_suspension_is_no_fault_of_a_device(tmp_path, monkeypatch):
+    """A run that was suspended (Ctrl-Z) for seconds ended, and blamed the ultrasound machine."""
+    path = Path(tempfile.mkdtemp(dir=tmp_path)) / "r.h5"
+    script = f"sleep 0.05; kill -STOP {os.getpid()}; sleep 1.1; kill -CONT {os.getpid()}"
+    scene = Scene(np.eye(4), np.array([400.0, -100.0, 0.0]), np.array([0.0, 0.0, -1.0]))
+    with (
+        EmulatedRobot() as robot,
+        AuspisEmulator(silence, clock=robot.clock, lines=8) as emulator,
+        Recorder(path, RecordingHeader("pixel", {}, 8, settings="{}")) as recorder,
+    ):
+        probe = LinearProbe(elements=8)
+        setup = Setup(robot.host, emulator.path, scene, {}, probe=probe, clock=robot.clock)
+        with Session(setup, recorder, watch=Watch(grace_s=0.5)) as session:
+            with subprocess.Popen(["sh", "-c", script]):
+                assert len(session.listen(5, robot.clock.now())) == 5
+            session.check()
+            monkeypatch.setattr("hw.recording.session._PERIOD_WALL_S", 1.0)
+            time.sleep(0.4)
+            assert "this program was suspended or held up for 0." in str(session.trouble())

@@ -82,6 +82,7 @@ def test_a_description_is_read(tmp_path):
         ('url = "/dev/ttyUSB0"', "", r"\[active_echo\] needs url"),
         ('url = "/dev/ttyUSB0"', "url = 3", "must be text"),
         ("settle_s = 1", "settle_s = -1", "positive"),
+        ("settle_s = 1", "settle_s = 300", r"\[robot\] settle_s must be positive and at most 30"),
         ("settle_s = 1", "settle = 1", "has no 'settle'"),
         ("elements = 64", "elements = 64.5", "whole number"),
         ("elements = 64", "elements = 1", "elements"),
