@@ -42,6 +42,12 @@ _UNIT = re.compile(
 )
 _CELL = re.compile(r"([a-z]*?)_?([0-4])[_,]?([0-4])")
 _NUMBERED = re.compile(r"([a-z]*?)_?(\d{1,2})")
+_OTHER_ROTATION = re.compile(r"r(?:ot|otvec)?[xyz]|roll|pitch|yaw|actualtcppose[0-5]")
+CONVERT = (
+    "rotation vectors, as robots of Universal Robots log them, and Euler angles are not read: "
+    "convert them to quaternions (docs/how-to/robot.md shows how)"
+)
+"""What to do about a pose of six numbers."""
 _SPELLINGS = {
     "mm": ("millimeter", "millimeters", "millimetre", "millimetres"),
     "cm": (),
@@ -162,6 +168,8 @@ def columns_of_header(names: list[str], quaternion: QuaternionOrder | None) -> C
 
 
 def _unknown(names: list[str], column: int) -> FormatError:
+    if _OTHER_ROTATION.fullmatch(_split(names[column])[0]):
+        return FormatError(f"the header's column {column + 1}, {quoted(names[column])}: {CONVERT}")
     return FormatError(
         f"the header's column {column + 1}, {quoted(names[column])}, is not known: name the "
         "columns time, frame, u, v, x, y, z, qx, qy, qz, qw or m11 to m34, or leave the header out"
