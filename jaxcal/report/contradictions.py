@@ -175,6 +175,12 @@ def _from_unmodelled(record: dict[str, Any]) -> list[tuple[float, str]]:
             "near an electromagnetic tracker, the edge of its range, or, along a single path, "
             "errors that change slowly? Record again without it: more images hardly help"
         ),
+        "targets": lambda: (
+            f"a second target, {values[0]:.1f} mm from the first one, in images "
+            f"{', '.join(map(str, found['images']))} (counted from 0) would explain the errors far "
+            "better: were two targets, or two echoes of one, marked in turn? Import the points of "
+            "one of them alone, or leave these images out by --robust, if they are few enough"
+        ),
     }
     return [(math.hypot(1.0, moved / stated), words[found["kind"]]())]
 
