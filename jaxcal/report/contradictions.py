@@ -38,6 +38,9 @@ Gaussian offsets than so many times the error of that fit."""
 SCATTER_TIMES = 1.3
 """Resampled calibrations may scatter by up to so many times the stated error."""
 
+MOST_IMAGES = 20
+"""So many images of a second target are named; the JSON has all."""
+
 _WAYS = {"lateral": "sideways", "range": "in depth"}
 """Errors within the image, in the order of the residuals, and in words."""
 
@@ -177,9 +180,9 @@ def _from_unmodelled(record: dict[str, Any]) -> list[tuple[float, str]]:
         ),
         "targets": lambda: (
             f"a second target, {values[0]:.1f} mm from the first one, in images "
-            f"{', '.join(map(str, found['images']))} (counted from 0) would explain the errors far "
-            "better: were two targets, or two echoes of one, marked in turn? Import the points of "
-            "one of them alone, or leave these images out by --robust, if they are few enough"
+            f"{', '.join(map(str, found['images'][:MOST_IMAGES]))}"
+            f"{', ...' * (len(found['images']) > MOST_IMAGES)} (counted from 0) would explain the "
+            "errors far better: were two targets, or two echoes of one, marked in turn?"
         ),
     }
     return [(math.hypot(1.0, moved / stated), words[found["kind"]]())]
