@@ -188,6 +188,7 @@ def test_empty_rows_at_the_end_do_not_count(tmp_path):
     [
         (["u", "v", "foo", *NAMES[3:]], "column 3, 'foo', is not known"),
         (["u", "v", "x", "y", "z", "rx", "ry", "rz"], "column 6, 'rx': rotation vectors"),
+        (["u", "v", "x", "y", "z", "roll [deg]"], "column 6, 'roll [deg]': rotation vectors"),
         (["actual_TCP_pose_0", "u", "v"], "convert them to quaternions (docs/how-to/robot.md"),
         (["u", "u", *NAMES[2:]], "columns 1 and 2 are both u"),
         (["u", "row", "x", "y", "tz", "qx", "qy", "qz", "qz"], "columns 8 and 9 are both qz"),
