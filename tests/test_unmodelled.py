@@ -157,6 +157,9 @@ def test_what_the_model_leaves_out_is_found_and_lowers_the_verdict(answers, kind
             values.append(tre["unmodelled"]["values"])
             assert any(WORDS[kind] in words for words in tre["contradictions"])
             assert tre["rms_mm"] > 1.2 * tre["stated_mm"]
+            if kind == "targets":
+                assert tre["unmodelled"]["images"] == SECOND
+                assert tre["rms_mm"] > values[-1][0]
             if kind == "step":
                 assert abs(tre["unmodelled"]["image"] - 31) <= 2
     assert found >= 3

@@ -30,6 +30,8 @@ _LEAST_SHARE = 0.15
 """Least share of the images in the smaller group: fewer may be as many outliers."""
 _ROUNDS = 20
 """Most rounds of dividing and fitting."""
+_MOST_SEARCHED = 150
+"""Of more images, so many, evenly spread, are divided first."""
 _DIRECTIONS = np.array([d for d in product((-1, 0, 1), repeat=3) if d > (0, 0, 0)], float)
 """Directions from which t is looked for: axes, and diagonals of faces and of the cube."""
 
@@ -62,22 +64,28 @@ def second_target(
     """
     count, unknowns = len(errors), rows.shape[-1] - 3
     known, along = rows[..., :unknowns], 0.5 * rows[..., unknowns:]
-    weight = 1 / np.sqrt(before)
-    sides = [_divided(errors, known, along, weight, along @ d) for d in _DIRECTIONS]
-    side = min(sides, key=lambda each: each[1])[0]
-    after, step = before, np.zeros(unknowns + 3)
-    for _ in range(_ROUNDS):
-        both = np.concatenate([known, side[:, None, None] * along], axis=-1)
-        after, step = tuned(*shortened(errors, both), count)
-        last, side = (
-            side,
-            _nearer(errors + known @ step[:-3], along @ step[-3:], 1 / np.sqrt(after)),
-        )
-        if (side == last).all():
-            break
     # Every kind gives a third of the unknowns' degrees of freedom; t takes those of two kinds.
     freedom = count - unknowns / 3 - np.array([1.5, 1.5, 0.0])
-    statistic = float(np.sum(freedom * np.log(before / after)))
+
+    def fitted(side: Array, some: Array) -> tuple[Array, Array]:
+        both = np.concatenate([known[some], side[:, None, None] * along[some]], axis=-1)
+        return tuned(*shortened(errors[some], both), len(some))
+
+    every = np.arange(count)
+    some = np.unique(np.linspace(0, count - 1, _MOST_SEARCHED).astype(int))
+    side = _divided(errors[some], known[some], along[some], 1 / np.sqrt(before))
+    after, step = fitted(side, some)
+    statistic, side = 0.0, np.zeros(count)
+    for _ in range(_ROUNDS):
+        base, half = errors + known @ step[:-3], along @ step[-3:]
+        last, side = side, _nearer(base, half, 1 / np.sqrt(after))
+        if (side == last).all():
+            break
+        after, step = fitted(side, every)
+        statistic = float(np.sum(freedom * np.log(before / after)))
+        if count > _MOST_SEARCHED and statistic < BY_CHANCE * count / 2:
+            # Further rounds gain little, and take long.
+            return None
     other = side != np.sign(side.sum() or 1)
     if statistic <= BY_CHANCE * count or other.sum() < _LEAST_SHARE * count:
         return None
@@ -96,24 +104,25 @@ def _divided(
     known: Float[Array, "n 3 p"],
     along: Float[Array, "n 3 3"],
     weight: Float[Array, " 3"],
-    half: Float[Array, "n 3"],
-) -> tuple[Float[Array, " n"], float]:
-    """How images are divided from a first K t / 2, and the sum of squares; the SDs stay."""
+) -> Float[Array, " n"]:
+    """How images are best divided, of the divisions from all first directions; the SDs stay."""
     basis = np.linalg.qr((known * weight[:, None]).reshape(-1, known.shape[-1]))[0]
-
-    def unexplained(columns: Array) -> Array:
-        return columns - basis @ (basis.T @ columns)
-
-    alone = unexplained((errors * weight).ravel())
-    side, squares = _nearer(alone.reshape(-1, 3) / weight, half, weight), np.inf
-    for _ in range(_ROUNDS):
-        moved = (side[:, None, None] * along * weight[:, None]).reshape(-1, 3)
-        t = -np.linalg.lstsq(unexplained(moved), alone, rcond=None)[0]
-        rest, half = alone + unexplained(moved @ t), along @ t
-        squares = float(rest @ rest)
-        # Without the second target, but with the unknowns that fit best beside it.
-        base = rest.reshape(-1, 3) / weight - side[:, None] * half
-        last, side = side, _nearer(base, half, weight)
-        if (side == last).all():
-            break
-    return side, squares
+    alone = (errors * weight).ravel()
+    alone -= basis @ (basis.T @ alone)
+    found = []
+    for direction in _DIRECTIONS:
+        base, half = alone.reshape(-1, 3) / weight, along @ direction
+        side, squares = np.zeros(len(errors)), np.inf
+        for _ in range(_ROUNDS):
+            last, side = side, _nearer(base, half, weight)
+            if (side == last).all():
+                break
+            moved = (side[:, None, None] * along * weight[:, None]).reshape(-1, 3)
+            moved -= basis @ (basis.T @ moved)
+            t = -np.linalg.lstsq(moved, alone, rcond=None)[0]
+            rest, half = alone + moved @ t, along @ t
+            squares = float(rest @ rest)
+            # Without the second target, but with the unknowns that fit best beside it.
+            base = rest.reshape(-1, 3) / weight - side[:, None] * half
+        found.append((squares, side))
+    return min(found, key=lambda each: each[0])[1]

@@ -144,6 +144,10 @@ def _from_unmodelled(record: dict[str, Any]) -> list[tuple[float, str]]:
     if found is None or not stated:
         return []
     values, moved = found["values"], found["moved_mm"]
+    if found["kind"] == "targets":
+        # To first order the answer moves by less than it is wrong by, which in simulation was
+        # of the order of the distance.
+        moved = max(moved, values[0])
     words = {
         "scale": lambda: (
             f"lateral positions that are too long by {100 * values[0]:.1f} % and ranges by "
