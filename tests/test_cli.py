@@ -381,7 +381,7 @@ def test_a_degenerate_set_is_solved_but_not_observable(degenerate, capfd, tmp_pa
         (["simulate", "x.h5", "--noise", "inf"], "'inf' is not zero or a positive number"),
         (["simulate", "x.h5", "--elevation", "nan"], "'nan' is not zero or a positive number"),
         (["simulate", "x.h5", "--elevation", "1e9"], "between 0 and 1000 mm"),
-        (["import", "x.h5"], "Missing argument"),
+        (["import", "x.h5"], "x.h5: name what to import, and then the recording"),
         (["import", "a", "b", "c", "x.h5"], "3 sources"),
         (["import", "a.igs.mha", "x.h5"], "a.igs.mha: no such file"),
         (["import", "a.csv", "x.h5"], "a.csv: no such file"),

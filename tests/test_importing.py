@@ -191,6 +191,9 @@ def test_empty_rows_at_the_end_do_not_count(tmp_path):
     ("names", "message"),
     [
         (["u", "v", "foo", *NAMES[3:]], "column 3, 'foo', is not known"),
+        (["u", "v", "x", "y", "z", "rx", "ry", "rz"], "column 6, 'rx': rotation vectors"),
+        (["u", "v", "x", "y", "z", "roll [deg]"], "column 6, 'roll [deg]': rotation vectors"),
+        (["actual_TCP_pose_0", "u", "v"], "convert them to quaternions (docs/how-to/robot.md"),
         (["u", "u", *NAMES[2:]], "columns 1 and 2 are both u"),
         (["u", "row", "x", "y", "tz", "qx", "qy", "qz", "qz"], "columns 8 and 9 are both qz"),
         (["u", "time", *NAMES[2:]], "has u but not all of u and v"),
@@ -314,6 +317,77 @@ def test_trackers_exports(tmp_path):
     (tmp_path / "t.csv").write_text(NDI.replace("0.5973400", "0.59x"))
     with pytest.raises(FormatError, match=r":2: column 7 is not a number: '0\.59x'"):
         read_tracker(tmp_path / "t.csv")
+
+
+POSE_NAMES, POSE_COLUMNS = NAMES[2:], [TRANSLATIONS, QUATERNIONS]
+TWO_TABLES = {
+    "frames": (["frame"], [10 * np.arange(6.0)], [10 * np.arange(6.0)]),
+    "times": (["time [s]"], [np.arange(6.0)], [np.arange(6.0)]),
+    "order": ([], [], []),
+}
+
+
+@pytest.mark.parametrize("reverse", [False, True])
+@pytest.mark.parametrize("key", TWO_TABLES)
+def test_poses_and_points_in_two_tables(tmp_path, key, reverse):
+    """The rows of the points are exchanged, except where only their order tells which is which."""
+    names, of_poses, of_points = TWO_TABLES[key]
+    order = np.arange(6) if key == "order" else np.array([4, 0, 1, 5, 3, 2])
+    order = np.sort(order) if key == "times" else order
+    (tmp_path / "poses.csv").write_text(
+        "\n".join(table([*names, *POSE_NAMES], [*of_poses, *POSE_COLUMNS]))
+    )
+    points = [*(column[order] for column in of_points), PIXELS[order]]
+    (tmp_path / "points.csv").write_text("\n".join(table([*names, "u", "v"], points)))
+    files = [tmp_path / "poses.csv", tmp_path / "points.csv"]
+    images = import_files(files[::-1] if reverse else files).recording.calibration
+    np.testing.assert_allclose(images.poses, POSES[order], atol=1e-12)
+    np.testing.assert_array_equal(images.measurements, PIXELS[order])
+    if key == "frames":
+        np.testing.assert_array_equal(images.frame, 10 * order)
+
+
+def _named(names, columns):
+    return "\n".join(",".join(map(str, row)) for row in [names, *zip(*columns, strict=True)])
+
+
+def test_two_tables_of_images_by_name(tmp_path):
+    """Folders do not count, and a point without a pose is left out."""
+    files = [f"a/{k}.png" for k in range(6)]
+    poses = [files, *np.column_stack(POSE_COLUMNS).T]
+    (tmp_path / "poses.csv").write_text(_named(["file", *POSE_NAMES], poses))
+    names = [f"b\\{k}.png" for k in (5, 0, 2, 3, 1, 9)]
+    (tmp_path / "p.csv").write_text(_named(["file", "u", "v"], [names, *PIXELS.T]))
+    imported = import_files([tmp_path / "poses.csv", tmp_path / "p.csv"])
+    images = imported.recording.calibration
+    np.testing.assert_allclose(images.poses, POSES[[5, 0, 2, 3, 1]], atol=1e-12)
+    np.testing.assert_array_equal(images.measurements, PIXELS[:5])
+    assert imported.notes == [f"1 point left out: {tmp_path}/poses.csv has no pose of that image"]
+    assert not imported.most_lost
+
+
+@pytest.mark.parametrize(
+    ("names", "numbers", "message"),
+    [
+        (["frame", "u", "v"], [0, 1, 2, 3, 4, 4], r"p.csv:7: image 4 is there twice"),
+        (
+            ["frame", "u", "v"],
+            [7, 8, 9, 10, 11, 12],
+            "poses.csv has the pose of none of its points",
+        ),
+        (["time", "u", "v"], range(6), "which pose of .*poses.csv belongs to which point"),
+        (["frame", *POSE_NAMES[:2]], range(6), "not all of x, y and z"),
+    ],
+)
+def test_two_tables_that_do_not_belong_together(tmp_path, names, numbers, message):
+    poses = [np.arange(6), *np.column_stack(POSE_COLUMNS).T]
+    (tmp_path / "poses.csv").write_text(_named(["frame", *POSE_NAMES], poses))
+    (tmp_path / "p.csv").write_text(_named(names, [numbers, *PIXELS.T]))
+    with pytest.raises(InputError, match=message):
+        import_files([tmp_path / "poses.csv", tmp_path / "p.csv"])
+    if names[0] == "frame" and names[1] == "u":
+        with pytest.raises(InputError, match="one table must hold the poses"):
+            import_files([tmp_path / "p.csv", tmp_path / "p.csv"])
 
 
 def test_a_trackers_own_numbers_of_frames(tmp_path):

@@ -15,7 +15,7 @@ from jaxcal.runtime.messages import counted
 
 
 @click.command("import")
-@click.argument("sources", nargs=-1, required=True, type=click.Path(), metavar="SOURCE...")
+@click.argument("sources", nargs=-1, type=click.Path(), metavar="SOURCE...")
 @click.argument("out", type=click.Path(), metavar="OUT.h5")
 @click.option(
     "--units",
@@ -42,11 +42,12 @@ from jaxcal.runtime.messages import counted
 def import_(sources: tuple[str, ...], out: str, add_to: str | None, **options: Any) -> int:
     """Turn other programs' files into a recording, OUT.h5.
 
-    SOURCE is one of: a table (CSV) with a pose and a point in each row; a tracked sequence of PLUS
-    or Slicer (.igs.mha, .igs.mhd, .igs.nrrd, .seq.nrrd), or a folder of PNG with --poses, whose
-    frames show the target; such a sequence, or an export of NDI ToolBox or Motive, and a file of
-    points (a table with frame or time, u and v, or Slicer's .mrk.json or .fcsv); or POSES (three
-    rows of four numbers for each image) and POINTS (a row "u v" in pixels).
+    SOURCE is one of: a table (CSV) with a pose and a point in each row, or two tables, one with the
+    poses and one with the points; a tracked sequence of PLUS or Slicer (.igs.mha, .igs.mhd,
+    .igs.nrrd, .seq.nrrd), or a folder of PNG with --poses, whose frames show the target; such a
+    sequence, or an export of NDI ToolBox or Motive, and a file of points (a table with frame or
+    time, u and v, or Slicer's .mrk.json or .fcsv); or POSES (three rows of four numbers for each
+    image) and POINTS (a row "u v" in pixels).
     docs/reference/formats.md says what each must hold.
     """
     _check(sources, out, add_to, options)
@@ -93,6 +94,8 @@ def import_(sources: tuple[str, ...], out: str, add_to: str | None, **options: A
 
 
 def _check(sources: tuple[str, ...], out: str, add_to: str | None, options: dict[str, Any]) -> None:
+    if not sources:
+        raise click.UsageError(f"{out}: name what to import, and then the recording to write")
     if len(sources) > 2:
         raise click.UsageError(
             f"{len(sources)} sources; one table or sequence, or two files that belong together, "

@@ -137,7 +137,8 @@ def wrong_frames(problem: Problem, estimate: tuple[str, ...] = ()) -> str | None
         return (
             f"the images do not fit together (typical error {apart:.2g} mm, of a target that moves "
             f"by {extent:.2g} mm in them): do poses and points belong together, with times of one "
-            "clock, and in which frames and conventions are the poses?"
+            "clock, is it one target in all images, and in which frames and conventions are the "
+            "poses?"
         )
     size = fit.scales * given.spacing
     if not known and not PIXELS_MM[0] <= size.max() <= PIXELS_MM[1]:

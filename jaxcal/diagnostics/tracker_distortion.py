@@ -51,15 +51,19 @@ def polynomials(positions: Float[Array, "n 3"], used: Bool[Array, " n"]) -> Floa
     return np.concatenate([np.stack([x, y, z], axis=1), _QUADRATIC * quadratic], axis=1)
 
 
-def columns(seen: ImageErrors, used: Bool[Array, " n"]) -> Float[Array, "n 3 k"]:
-    """Derivatives K of one recording's errors (mm) by the coefficients (mm).
+def by_target(seen: ImageErrors) -> Float[Array, "n 3 3"]:
+    """Derivatives of one recording's errors by the target, 0 for elevational errors.
 
-    Elevational errors do not count: the placement of the target may change with the pose as well.
+    Those do not count: the placement of the target may change with the pose as well.
     """
+    return seen.rows[0][..., block_slice(seen.blocks, "point")] * [[1.0], [1.0], [0.0]]
+
+
+def columns(seen: ImageErrors, used: Bool[Array, " n"]) -> Float[Array, "n 3 k"]:
+    """Derivatives K of one recording's errors (mm) by the coefficients (mm)."""
     positions = np.asarray(seen.problem.poses)[0, :, :3, 3]
     # A position that is off moves the errors as a target does that is off the other way.
-    by_target = seen.rows[0][..., block_slice(seen.blocks, "point")] * [[1.0], [1.0], [0.0]]
-    along = -polynomials(positions, used)[:, None, :, None] * by_target[:, :, None, :]
+    along = -polynomials(positions, used)[:, None, :, None] * by_target(seen)[:, :, None, :]
     return along.reshape(*along.shape[:2], COEFFICIENTS)
 
 

@@ -25,7 +25,9 @@ the limit of a slip. An answer within bounds is first moved to the optimum of Ga
 A seventh, a distortion of the tracked positions, has a random field instead of few parameters
 (:mod:`jaxcal.diagnostics.tracker_distortion`). Its limit is from simulations with errors that grow
 with depth as well. Half of it must be exceeded without any neighbourhood, too: a few neighbours
-with an error in common imitate a distortion.
+with an error in common imitate a distortion. An eighth, a second target
+(:mod:`jaxcal.diagnostics.second_target`), has a parameter for each image, which says which of the
+two it shows. It goes first if it is the clearest in spite of the n ln 2 that these choices cost.
 
 References: Wilks 1938; Andrews 1993 (a change at an unknown place).
 """
@@ -39,6 +41,8 @@ import numpy as np
 from jaxcal.diagnostics import tracker_distortion
 from jaxcal.diagnostics.gaussian_offsets import GaussianOffsets, in_sds, shortened, tuned
 from jaxcal.diagnostics.image_errors import ImageErrors
+from jaxcal.diagnostics.second_target import FEWEST as FEWEST_OF_TWO
+from jaxcal.diagnostics.second_target import second_target
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Bool, Float
 from jaxcal.runtime.arrays import map_arrays
@@ -80,15 +84,18 @@ class Unmodelled:
     """An error that the model leaves out, and that the residuals show.
 
     Attributes:
-        kind: ``scale``, ``slip``, ``step``, ``skew``, ``curve``, ``beside`` or ``distortion``.
+        kind: ``scale``, ``slip``, ``step``, ``skew``, ``curve``, ``beside``, ``distortion`` or
+            ``targets``.
         values: its parameters: by which shares lateral positions and ranges are too long; motion of
             X from the first image to the last (lateral and axial, mm; about y, rad); by which share
             of the depth lateral positions are too large; by how many mm ranges are too long 20 mm
-            to the side; the distance m in mm; the root mean square distortion in mm.
+            to the side; the distance m in mm; the root mean square distortion in mm; the distance
+            between two targets in mm.
         statistic: 2 ln LR.
         step: by how much the unknowns would change if it were corrected; of a distortion, by one SD
             of each of its coefficients.
         image: the first one after a step, or None.
+        images: those that show the second target.
     """
 
     kind: str
@@ -96,6 +103,7 @@ class Unmodelled:
     statistic: float
     step: Float[Array, " p *k"]
     image: int | None = None
+    images: tuple[int, ...] = ()
 
     def moved(
         self, points: Float[Array, "m 2"], jacobian: Float[Array, "m 3 p"], face_mm: float
@@ -163,7 +171,13 @@ def unmodelled(calibration: Calibration) -> list[Unmodelled]:
             if each is not None:
                 found.append(replace(each, image=image))
         found += _distortion(answer, seen, used)
-    return sorted(found, key=lambda each: -each.statistic / _BY_CHANCE[each.kind])
+        found.sort(key=lambda each: -each.statistic / _BY_CHANCE[each.kind])
+        two = _two_targets(answer, seen, used)
+    if two is None:
+        return found
+    after = two.statistic - 2 * np.log(2) * used.sum()
+    first = all(after > each.statistic for each in found)
+    return [two, *found] if first else [*found, two]
 
 
 def _columns(
@@ -237,6 +251,24 @@ def _fit(
         # What has to be added is what is missing.
         values = -values
     return Unmodelled(kind, values, statistic, step)
+
+
+def _two_targets(
+    answer: Calibration, seen: ImageErrors, used: Bool[Array, " n"]
+) -> Unmodelled | None:
+    """A second target, if the residuals of the images show it."""
+    if used.sum() < FEWEST_OF_TWO:
+        return None
+    rows = np.concatenate([seen.rows[0], tracker_distortion.by_target(seen)], axis=-1)[None]
+    whitened = in_sds(answer, replace(seen, rows=rows))
+    errors, rows = whitened.errors[0][used], whitened.rows[0][used]
+    before, _ = tuned(*shortened(errors, rows[..., :-3]), len(errors))
+    found = second_target(errors, rows, before)
+    if found is None:
+        return None
+    apart = np.array([np.linalg.norm(found.apart)])
+    images = tuple(np.flatnonzero(used)[found.other].tolist())
+    return Unmodelled("targets", apart, found.statistic, found.step, images=images)
 
 
 def _distortion(

@@ -42,6 +42,14 @@ _UNIT = re.compile(
 )
 _CELL = re.compile(r"([a-z]*?)_?([0-4])[_,]?([0-4])")
 _NUMBERED = re.compile(r"([a-z]*?)_?(\d{1,2})")
+_OTHER_ROTATION = re.compile(
+    r"(?:r(?:ot|otvec)?[xyz]|roll|pitch|yaw)(?:deg|rad)?|actualtcppose[0-5]"
+)
+CONVERT = (
+    "rotation vectors, as robots of Universal Robots log them, and Euler angles are not read: "
+    "convert them to quaternions (docs/how-to/robot.md shows how)"
+)
+"""What to do about a pose of six numbers."""
 _SPELLINGS = {
     "mm": ("millimeter", "millimeters", "millimetre", "millimetres"),
     "cm": (),
@@ -107,6 +115,9 @@ def columns_of_header(names: list[str], quaternion: QuaternionOrder | None) -> C
     Raises:
         FormatError: a name that is not known, twice, or missing beside others; units that differ.
     """
+    for index, name in enumerate(names):
+        if _OTHER_ROTATION.fullmatch(_split(name)[0]):
+            raise FormatError(f"the header's column {index + 1}, {quoted(name)}: {CONVERT}")
     bases, units = zip(*(_base_and_unit(name) for name in names), strict=True)
     roles: dict[str, int] = {}
     rest: list[int] = []

@@ -14,7 +14,7 @@ from jaxcal.io.poses_by_time import times_of_table, with_poses_by_time
 from jaxcal.io.sequence import FolderPixels, TrackedSequence
 from jaxcal.io.sources import ImportOptions, kind_of, read_rows, read_tracked, refuse
 from jaxcal.io.table import first_line
-from jaxcal.io.text import read_poses
+from jaxcal.io.text import PoseTable, read_poses
 from jaxcal.runtime.array_types import Bool, Float
 from jaxcal.runtime.messages import quoted
 
@@ -61,23 +61,31 @@ def opened(
         return merged, None, notes
     if of_table:
         table = read_rows(options.poses, options)
-        if table.poses is None or table.time is None:
-            raise InputError(f"{table.name}: needs columns of times and of poses")
-        found = TrackedSequence(
-            {PROBE_TO_TRACKER: table.poses},
-            {PROBE_TO_TRACKER: np.ones(len(table), bool)},
-            times_of_table(table, sequence),
-            np.zeros(len(table), bool),
-            source=table.name,
-            length_stated=table.length_stated,
-            time_stated=table.time_stated,
-        )
-        return sequence, found, table.notes
+        return sequence, tracking_of_table(table, sequence), table.notes
     tracking = read_tracked(options.poses, options.pose_units)
     start, end, said = _frames(tracking, options)
     poses, valid = tracking.poses(start, end)
     pair = start, end
     return sequence, replace(tracking, transforms={pair: poses}, valid={pair: valid}), said
+
+
+def tracking_of_table(table: PoseTable, images: TrackedSequence) -> TrackedSequence:
+    """The poses of a table, with their times on the clock of the images.
+
+    Raises:
+        InputError: no times or no poses, or another clock.
+    """
+    if table.poses is None or table.time is None:
+        raise InputError(f"{table.name}: needs columns of times and of poses")
+    return TrackedSequence(
+        {PROBE_TO_TRACKER: table.poses},
+        {PROBE_TO_TRACKER: np.ones(len(table), bool)},
+        times_of_table(table, images),
+        np.zeros(len(table), bool),
+        source=table.name,
+        length_stated=table.length_stated,
+        time_stated=table.time_stated,
+    )
 
 
 def tracked_poses(

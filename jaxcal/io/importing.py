@@ -23,8 +23,10 @@ from jaxcal.io.frame_poses import opened, tracked_poses
 from jaxcal.io.poses_by_time import lag_of_points, with_poses_by_time
 from jaxcal.io.sequence import Pixels, TrackedSequence
 from jaxcal.io.sources import SEQUENCES, ImportOptions, kind_of, read_rows, refuse
+from jaxcal.io.table import first_line, parse_numbers, read_table
 from jaxcal.io.target_search import FrameResults, search_target
-from jaxcal.io.text import read_crosswire, recording_of
+from jaxcal.io.text import PoseTable, read_crosswire, recording_of
+from jaxcal.io.two_tables import one_of_two_tables
 from jaxcal.runtime.array_types import Bool, Float, Int
 from jaxcal.runtime.messages import counted
 
@@ -74,6 +76,9 @@ def import_files(
     unused = "source", "target", "lag_s", "points", "target_kind", "region", "orientation"
     refuse(options, unused, "does not go with a table of poses and points: it is for sequences")
     options = replace(options, spacing_mm=_spacing(None, options), spacing_from=None)
+    if len(sources) == 2 and "markups" not in kinds and _have_headers(sources):
+        tables = [read_rows(each, options, ignore_time=options.ignore_time) for each in sources]
+        return _from_table(*one_of_two_tables(*tables), options)
     if len(sources) == 2 and "markups" not in kinds:
         if options.units == "mm":
             raise InputError("a pair of text files holds pixels: --units mm does not go with it")
@@ -93,14 +98,27 @@ def import_files(
             "with poses is needed"
         )
     table = read_rows(sources[0], options, ignore_time=options.ignore_time)
-    notes = table.notes
+    return _from_table(table, table.notes, 0, options)
+
+
+def _have_headers(sources: Sequence[str | os.PathLike[str]]) -> bool:
+    """Whether two text files are tables with headers, and not the pair of rows R|t and u v."""
+    if not any(first_line(source)[1] for source in sources):
+        return False
+    first = parse_numbers(read_table(sources[0], header=False).rows[0])
+    return len(first) != 4 or None in first
+
+
+def _from_table(table: PoseTable, notes: list[str], lost: int, options: ImportOptions) -> Imported:
+    """The recording of a table with poses and points; ``lost`` further points have no pose."""
     if table.time is None and options.ignore_time:
         notes = [*notes, "time stamps are missing or cannot be read: not kept"]
     if table.time is not None:
         time, said = _good_time(table.time, lambda row: f"{table.name}:{table.lines[row]}", options)
         table, notes = replace(table, time=time), notes + said
     with _naming_pose_units(options, table.length_stated):
-        return Imported(recording_of(table, options.spacing_mm, options.minimum), notes)
+        recording = recording_of(table, options.spacing_mm, options.minimum)
+    return Imported(recording, notes, most_lost=len(table) < lost)
 
 
 @contextmanager

@@ -16,7 +16,7 @@ import numpy as np
 from jaxcal import FormatError, InputError
 from jaxcal.data.poses import QuaternionOrder, check_poses, rotations_from_quaternions
 from jaxcal.data.recording import MINIMUM_IMAGES, Recording, make_images
-from jaxcal.io.columns import LENGTHS_MM, Columns, LengthUnit, columns_of_header
+from jaxcal.io.columns import CONVERT, LENGTHS_MM, Columns, LengthUnit, columns_of_header
 from jaxcal.io.given_files import naming
 from jaxcal.io.table import Table, first_line, parse_numbers, read_table
 from jaxcal.runtime.array_types import Float, Int
@@ -164,7 +164,7 @@ def recording_of(
     """
     if table.poses is None or table.points is None:
         missing = "poses" if table.poses is None else "points (u and v, or lateral and range)"
-        raise InputError(f"{table.name}: holds no {missing}")
+        raise InputError(f"{table.name}: holds no {missing}: name the file that has them as well")
     images = make_images(
         table.poses,
         table.points,
@@ -208,7 +208,9 @@ def read_crosswire(
     """
     transforms = read_table(transforms_path, header=False, separator="")
     rows = _fixed(
-        transforms, (4,), "3 rotation numbers and a translation, separated by white space"
+        transforms,
+        (4,),
+        "3 rotation numbers and a translation, separated by white space; points come second",
     )
     if len(rows) % 4 == 0 and (rows[3::4] == [0, 0, 0, 1]).all():
         # Whole matrices: no row of a rotation is zero.
@@ -282,9 +284,10 @@ def _fixed(
     """All numbers of a table that has no header."""
     width = len(table.rows[0])
     if width not in widths:
+        hint = f"; {CONVERT}" if width == 6 else ""
         raise FormatError(
             f"{table.row(0)}: {width} columns; {' or '.join(map(str, widths))} are needed "
-            f"({columns})"
+            f"({columns}){hint}"
         )
     return table.numbers(tuple(range(width)), finite=finite)
 
@@ -300,6 +303,8 @@ def _columns(table: Table, quaternion: QuaternionOrder | None) -> Columns:
         hint = ", or a first line that names the columns"
         if width == 2:
             hint = " (name two columns of points by a first line u,v)"
+        if width == 4:
+            hint = " (rows R t are one of a pair of files: POSES POINTS OUT.h5)"
         raise FormatError(
             f"{table.row(0)}: {width} columns without a header; 15 or 19 (time, 12 or 16 "
             f"pose numbers, u and v) or 10 (time, x, y, z, a quaternion, u and v) are needed{hint}"

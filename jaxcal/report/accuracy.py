@@ -228,6 +228,7 @@ def _unmodelled(answer: Calibration, grid: Float[np.ndarray, "m 2"]) -> dict[str
         "moved_mm": moved,
         "slip_mm": slip if first.kind in ("slip", "step") else None,
         "image": first.image,
+        "images": list(first.images) or None,
     }
 
 

@@ -38,6 +38,9 @@ Gaussian offsets than so many times the error of that fit."""
 SCATTER_TIMES = 1.3
 """Resampled calibrations may scatter by up to so many times the stated error."""
 
+MOST_IMAGES = 20
+"""So many images of a second target are named; the JSON has all."""
+
 _WAYS = {"lateral": "sideways", "range": "in depth"}
 """Errors within the image, in the order of the residuals, and in words."""
 
@@ -148,6 +151,10 @@ def _from_unmodelled(record: dict[str, Any]) -> list[tuple[float, str]]:
         )
     else:
         lengths = "check pixel size, sound speed and the tracker's unit, or estimate the scale"
+    if found["kind"] == "targets":
+        # To first order the answer moves by less than it is wrong by, which in simulation was
+        # of the order of the distance.
+        moved = max(moved, values[0])
     words = {
         "scale": lambda: (
             f"lateral positions that are too long by {100 * values[0]:.1f} % and ranges by "
@@ -180,6 +187,12 @@ def _from_unmodelled(record: dict[str, Any]) -> list[tuple[float, str]]:
             "the probe is nearly in the same place, would explain the errors far better: metal "
             "near an electromagnetic tracker, the edge of its range, or, along a single path, "
             "errors that change slowly? Record again without it: more images hardly help"
+        ),
+        "targets": lambda: (
+            f"a second target, {values[0]:.1f} mm from the first one, in images "
+            f"{', '.join(map(str, found['images'][:MOST_IMAGES]))}"
+            f"{', ...' * (len(found['images']) > MOST_IMAGES)} (counted from 0) would explain the "
+            "errors far better: were two targets, or two echoes of one, marked in turn?"
         ),
     }
     return [(math.hypot(1.0, moved / stated), words[found["kind"]]())]

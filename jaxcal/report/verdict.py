@@ -10,6 +10,7 @@ import math
 from typing import Any
 
 from jaxcal.diagnostics.warnings import WEAK_MM
+from jaxcal.report.contradictions import MOST_IMAGES
 from jaxcal.report.paragraphs import listed
 from jaxcal.report.resampled import resampled_sentences
 from jaxcal.result.saved import ASKED_FOR
@@ -64,7 +65,8 @@ def frames_of_images(record: dict[str, Any]) -> list[str]:
     frame = record.get("frame")
     influence = record.get("influence") or {"most": []}
     suspected = (each["image"] for each in record["suspects"])
-    named = {*record["outliers"], *suspected, *influence["most"][:3]}
+    second = _unmodelled(record).get("images") or []
+    named = {*record["outliers"], *suspected, *influence["most"][:3], *second[:MOST_IMAGES]}
     told = [] if frame is None else [(k, frame[k]) for k in sorted(named) if frame[k] != k]
     if not told:
         return []
@@ -73,6 +75,11 @@ def frames_of_images(record: dict[str, Any]) -> list[str]:
     return [
         f"Images are counted from 0 in the recording; in the file that it came from, {pairs}{more}."
     ]
+
+
+def _unmodelled(record: dict[str, Any]) -> dict[str, Any]:
+    """What the model leaves out and the residuals show; empty if nothing is."""
+    return (record.get("tre") or {}).get("unmodelled") or {}
 
 
 def headline(record: dict[str, Any]) -> str:
@@ -368,6 +375,11 @@ def advice(record: dict[str, Any]) -> list[str]:
         advice.append(
             "Leave out images in which the target was picked wrongly (they have the largest "
             "residuals), or add images; then calibrate again."
+        )
+    elif _unmodelled(record).get("kind") == "targets":
+        advice.append(
+            "Import the points of one of the two targets alone, or calibrate with --robust, which "
+            "leaves the images of the other one out if they are few."
         )
     elif not record.get("doubtful_unit") and (few or record["verdict"] == "uncertain"):
         advice.append(_addition(record))

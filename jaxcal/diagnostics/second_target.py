@@ -1,0 +1,128 @@
+"""Were two targets marked in turn, some images of one and some of the other?
+
+Then the target of image i is c + s_i t / 2 with s_i = 1 or -1. With e the errors, J their
+derivatives by the unknowns and K_i those of image i by the target, s and t are alternately fitted
+to e + J d + s K t / 2, from several directions of t. Elevational errors do not tell which target an
+image shows, as offsets may come in two groups as well.
+
+The best of the 2^n ways to divide n images fits better by chance, too. 2 ln LR was at most 2.2 n
+for 20 to 150 simulated images of one target, whatever the offsets' distribution, and at most 1.9 n
+for 20 to 30 images of the real cross-wire recording.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxcal.diagnostics.gaussian_offsets import shortened, tuned
+from jaxcal.runtime.array_types import Bool, Float
+
+Array = np.ndarray
+
+FEWEST = 20
+"""With fewer images in use a second target is not looked for: chance would imitate it."""
+BY_CHANCE = 3.0
+"""What 2 ln LR must exceed, for each image."""
+_LEAST_SHARE = 0.15
+"""Least share of the images in the smaller group: fewer may be as many outliers."""
+_ROUNDS = 20
+"""Most rounds of dividing and fitting."""
+_MOST_SEARCHED = 150
+"""Of more images, so many, evenly spread, are divided first."""
+_DIRECTIONS = np.array([d for d in product((-1, 0, 1), repeat=3) if d > (0, 0, 0)], float)
+"""Directions from which t is looked for: axes, and diagonals of faces and of the cube."""
+
+
+class SecondTarget(NamedTuple):
+    """Two targets that explain the errors.
+
+    Attributes:
+        statistic: 2 ln LR.
+        apart: from one target to the other, tracker's frame, mm.
+        other: which images show the target that fewer images show.
+        step: of the unknowns.
+    """
+
+    statistic: float
+    apart: Float[Array, " 3"]
+    other: Bool[Array, " n"]
+    step: Float[Array, " p"]
+
+
+def second_target(
+    errors: Float[Array, "n 3"], rows: Float[Array, "n 3 q"], before: Float[Array, " 3"]
+) -> SecondTarget | None:
+    """Two targets, if the errors of n images show them.
+
+    Args:
+        errors: in any unit of each kind.
+        rows: J and, as the last three columns, K; zero for elevational errors.
+        before: mean squared errors of each kind with one target.
+    """
+    count, unknowns = len(errors), rows.shape[-1] - 3
+    known, along = rows[..., :unknowns], 0.5 * rows[..., unknowns:]
+    # Every kind gives a third of the unknowns' degrees of freedom; t takes those of two kinds.
+    freedom = count - unknowns / 3 - np.array([1.5, 1.5, 0.0])
+
+    def fitted(side: Array, some: Array) -> tuple[Array, Array]:
+        both = np.concatenate([known[some], side[:, None, None] * along[some]], axis=-1)
+        return tuned(*shortened(errors[some], both), len(some))
+
+    every = np.arange(count)
+    some = np.unique(np.linspace(0, count - 1, _MOST_SEARCHED).astype(int))
+    side = _divided(errors[some], known[some], along[some], 1 / np.sqrt(before))
+    after, step = fitted(side, some)
+    statistic, side = 0.0, np.zeros(count)
+    for _ in range(_ROUNDS):
+        base, half = errors + known @ step[:-3], along @ step[-3:]
+        last, side = side, _nearer(base, half, 1 / np.sqrt(after))
+        if (side == last).all():
+            break
+        after, step = fitted(side, every)
+        statistic = float(np.sum(freedom * np.log(before / after)))
+        if count > _MOST_SEARCHED and statistic < BY_CHANCE * count / 2:
+            # Further rounds gain little, and take long.
+            return None
+    other = side != np.sign(side.sum() or 1)
+    if statistic <= BY_CHANCE * count or other.sum() < _LEAST_SHARE * count:
+        return None
+    return SecondTarget(statistic, step[-3:], other, step[:-3])
+
+
+def _nearer(
+    base: Float[Array, "n 3"], half: Float[Array, "n 3"], weight: Float[Array, " 3"]
+) -> Float[Array, " n"]:
+    """1 where an error is smaller with half of t added, -1 where it is with that subtracted."""
+    return np.where(np.sum(base * half * weight**2, axis=1) <= 0, 1.0, -1.0)
+
+
+def _divided(
+    errors: Float[Array, "n 3"],
+    known: Float[Array, "n 3 p"],
+    along: Float[Array, "n 3 3"],
+    weight: Float[Array, " 3"],
+) -> Float[Array, " n"]:
+    """How images are best divided, of the divisions from all first directions; the SDs stay."""
+    basis = np.linalg.qr((known * weight[:, None]).reshape(-1, known.shape[-1]))[0]
+    alone = (errors * weight).ravel()
+    alone -= basis @ (basis.T @ alone)
+    found = []
+    for direction in _DIRECTIONS:
+        base, half = alone.reshape(-1, 3) / weight, along @ direction
+        side, squares = np.zeros(len(errors)), np.inf
+        for _ in range(_ROUNDS):
+            last, side = side, _nearer(base, half, weight)
+            if (side == last).all():
+                break
+            moved = (side[:, None, None] * along * weight[:, None]).reshape(-1, 3)
+            moved -= basis @ (basis.T @ moved)
+            t = -np.linalg.lstsq(moved, alone, rcond=None)[0]
+            rest, half = alone + moved @ t, along @ t
+            squares = float(rest @ rest)
+            # Without the second target, but with the unknowns that fit best beside it.
+            base = rest.reshape(-1, 3) / weight - side[:, None] * half
+        found.append((squares, side))
+    return min(found, key=lambda each: each[0])[1]

@@ -1,0 +1,106 @@
+"""A table of poses and a table of points as one: which rows of the two are of the same image."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from jaxcal import InputError
+from jaxcal.io.frame_poses import tracking_of_table
+from jaxcal.io.poses_by_time import with_poses_by_time
+from jaxcal.io.sequence import TrackedSequence
+from jaxcal.io.text import PoseTable
+from jaxcal.runtime.array_types import Bool, Float
+from jaxcal.runtime.messages import counted
+
+
+def one_of_two_tables(first: PoseTable, second: PoseTable) -> tuple[PoseTable, list[str], int]:
+    """The points of one table with the poses of the other, in the order of the points.
+
+    Rows belong together by a column ``file`` or ``frame`` that both tables have; else by time, and
+    poses are interpolated; else in their order, if there are as many poses as points and the table
+    of points names neither file nor frame nor time.
+
+    Returns:
+        The table, notes for the user, and how many points were left out because they have no pose.
+
+    Raises:
+        InputError: not poses in one table and points in the other, rows that cannot be matched, or
+            two poses of one image.
+    """
+    poses, points = (first, second) if first.poses is not None else (second, first)
+    if poses.poses is None or points.points is None or (poses.points, points.poses) != (None, None):
+        raise InputError(
+            f"{first.name} and {second.name}: one table must hold the poses, the other one the "
+            "points (u and v, or lateral and range); a table with both is imported by itself"
+        )
+    found, has_pose, said = _poses_of(poses, points)
+    lost = int((~has_pose).sum())
+    if lost == len(points):
+        raise InputError(f"{points.name}: {poses.name} has the pose of none of its points")
+    kept = np.flatnonzero(has_pose)
+    chosen = {
+        name: None if (values := getattr(points, name)) is None else values[kept]
+        for name in ("points", "time", "frame")
+    }
+    table = replace(
+        points,
+        name=f"{poses.name} with {points.name}",
+        lines=[points.lines[row] for row in kept],
+        poses=found[kept],
+        length_stated=poses.length_stated,
+        **chosen,
+    )
+    return table, poses.notes + points.notes + said, lost
+
+
+def _poses_of(
+    poses: PoseTable, points: PoseTable
+) -> tuple[Float[np.ndarray, "n 4 4"], Bool[np.ndarray, " n"], list[str]]:
+    """A pose for each point, whether it has one, and notes."""
+    assert poses.poses is not None
+    for names in (_file_names, _frame_numbers):
+        named, wanted = names(poses), names(points)
+        if named is not None and wanted is not None:
+            places = _rows_by_image(poses, named)
+            rows = np.array([places.get(image, -1) for image in _rows_by_image(points, wanted)])
+            lost = counted(int((rows < 0).sum()), "point")
+            said = [f"{lost} left out: {poses.name} has no pose of that image"]
+            return poses.poses[rows], rows >= 0, said * bool((rows < 0).any())
+    if poses.time is not None and points.time is not None:
+        everywhere = np.ones(len(points), bool)
+        images = TrackedSequence(
+            {}, {}, points.time, everywhere, source=points.name, clock=points.clock
+        )
+        images, said = with_poses_by_time(images, tracking_of_table(poses, images))
+        (found,), (valid,) = images.transforms.values(), images.valid.values()
+        return found, valid, said
+    unnamed = points.file is None and points.frame is None and points.time is None
+    if unnamed and len(poses) == len(points):
+        return poses.poses, np.ones(len(points), bool), []
+    raise InputError(
+        f"{points.name}: which pose of {poses.name} belongs to which point? Give both tables a "
+        "column frame, file or time (without one, as many poses as points, in the same order)"
+    )
+
+
+def _file_names(table: PoseTable) -> list[str] | None:
+    """Names of the images' files, without folders."""
+    return None if table.file is None else [re.split(r"[/\\]", name)[-1] for name in table.file]
+
+
+def _frame_numbers(table: PoseTable) -> list[int] | None:
+    return None if table.frame is None else table.frame.tolist()
+
+
+def _rows_by_image(table: PoseTable, images: Sequence[object]) -> dict[object, int]:
+    """The row of each image."""
+    rows: dict[object, int] = {}
+    for row, image in enumerate(images):
+        if image in rows:
+            raise InputError(f"{table.name}:{table.lines[row]}: image {image} is there twice")
+        rows[image] = row
+    return rows
