@@ -89,7 +89,11 @@ def alternate(
             normal = barrier(accumulate(iterate, held, images, None))
             eye = jnp.eye(len(normal.gradient), dtype=normal.gradient.dtype)[..., None]
             matrix, gradient = barrier((normal.stacked() * (1 + 16 * eps * eye), normal.gradient))
-            return barrier(iterate.moved(barrier(dense.solve_batch_last(matrix, -gradient))))
+            step = barrier(dense.solve_batch_last(matrix, -gradient))
+            # Along a direction that the images do not determine, a step is rounding and can
+            # overflow: then X and c stay, and their information says what is not determined.
+            finite = jnp.all(jnp.isfinite(step), axis=0)
+            return barrier(iterate.moved(jnp.where(finite, step, 0)))
 
         after = jax.lax.fori_loop(0, inner_steps, gauss_newton, state.iterate)
         kept = state.trace
