@@ -621,6 +621,21 @@ def test_segment_command_refuses(arguments, said, raw_file, capfd):
     assert [path.name for path in raw_file.parent.iterdir()] == ["raw.h5"]
 
 
+def test_calibrate_tells_what_a_person_should_know_of_the_segmentation():
+    recording = simulate_recording(Protocol(images=20, noise_mm=0.2, probe=L14_5, raw=True), 3)
+
+    def told(share):
+        images = recording.calibration
+        lossy = replace(images, measurements=lose(images.measurements, share))
+        warned = jaxcal.calibrate(replace(recording, calibration=lossy), "conventional").warnings
+        expected = segment(lossy, recording.probe).warnings
+        assert len(expected) == (share > 0)
+        return [text for text in warned if "did not answer" in text] == list(expected)
+
+    assert told(0.0)
+    assert told(0.2)
+
+
 def test_segment_command_names_the_file_and_row(raw_file, capfd):
     with h5py.File(raw_file, "r+") as file:
         file["calibration/time_of_flight"][7] *= 1e6

@@ -172,15 +172,19 @@ def calibrate(
         robust,
     )
     # Not in own modes: segmenting times of flight imports JAX, whose modes are entered after that.
+    recording = problem if isinstance(problem, Recording) else None
+    warned: tuple[str, ...] = ()
+    if recording is not None:
+        problem, warned = Problem.segmented(recording)
     found = _calibrated(as_problem(problem, "jaxcal.calibrate"), request)
-    if isinstance(problem, Recording):
-        found = replace(found, probe=problem.probe, pose_frames=problem.pose_frames)
-        problem = problem.calibration
-    if not isinstance(problem, Images):
+    if recording is not None:
+        found = replace(found, probe=recording.probe, pose_frames=recording.pose_frames)
+    images = problem if recording is None else recording.calibration
+    if not isinstance(images, Images):
         return found
-    order = problem.out_of_order()
-    notes = found.notes if order is None else (*found.notes, order)
-    return replace(found, frame_size=problem.frame_size, notes=notes)
+    order = images.out_of_order()
+    notes = (*warned, *found.notes, *(() if order is None else (order,)))
+    return replace(found, frame_size=images.frame_size, notes=notes)
 
 
 @in_own_modes

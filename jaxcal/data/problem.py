@@ -196,7 +196,6 @@ class Problem:
         )
 
     @classmethod
-    @in_own_modes
     def from_recording(
         cls, recording: Recording | Images, dtype: DTypeLike | None = None
     ) -> Problem:
@@ -210,6 +209,18 @@ class Problem:
             InputError: for times of flight that cannot be segmented, or come without a probe, and
                 for a dtype that is not floating.
         """
+        return cls.segmented(recording, dtype)[0]
+
+    @classmethod
+    @in_own_modes
+    def segmented(
+        cls, recording: Recording | Images, dtype: DTypeLike | None = None
+    ) -> tuple[Problem, tuple[str, ...]]:
+        """As :meth:`from_recording`, with what a person should know of the segmentation.
+
+        Returns:
+            The problem, and warnings; none if the recording holds points.
+        """
         probe = recording.probe if isinstance(recording, Recording) else None
         images = images_of(recording, "jaxcal.Problem.from_recording")
         dtype = _floating(dtype)
@@ -221,16 +232,16 @@ class Problem:
         def array(values: np.ndarray | float) -> Any:
             return put(np.asarray(values, dtype=dtype))
 
-        channels = None
+        channels, warnings = None, ()
         raw = images.measurements if images.kind == "time_of_flight" else images.time_of_flight
         if raw is not None and (probe is not None or images.kind == "time_of_flight"):
             from jaxcal.data.segmentation.segment import segment
 
-            segmented = segment(recording)
+            found = segment(recording)
             if images.kind == "time_of_flight":
-                images = segmented.images
+                images, warnings = found.images, found.warnings
             assert probe is not None
-            accepted = segmented.accepted & images.mask[:, None]
+            accepted = found.accepted & images.mask[:, None]
             distances = np.where(accepted, probe.one_way_range_mm(raw), 0.0)
             channels = Channels(
                 array(distances), array(accepted.astype(float)), array(probe.element_positions())
@@ -238,7 +249,7 @@ class Problem:
         pixels = images.kind == "pixel"
         known = not pixels or images.spacing_mm is not None
         spacing = np.ones(2) if images.spacing_mm is None else np.asarray(images.spacing_mm)
-        return cls(
+        problem = cls(
             poses=array(images.poses),
             measurements=array(images.measurements),
             mask=array(images.mask.astype(float)),
@@ -253,6 +264,7 @@ class Problem:
             spacing_known=known,
             curved=isinstance(probe, CurvilinearProbe),
         )
+        return problem, warnings
 
     @classmethod
     def from_arrays(
