@@ -267,6 +267,19 @@ def test_calibrate_json_keeps_the_contract(calibrated, simulated):
     assert np.std(np.array(record["elevation_mm"]) - truth.elevation) < 0.5
 
 
+def test_images_are_left_out_by_their_numbers(simulated, capfd):
+    recording = jaxcal.load(simulated)
+    asked = ("--method", "conventional", "--leave-out", "7-9, 3,8")
+    record = json.loads(told(capfd, "calibrate", simulated, "--json", *asked))
+    assert record["warnings"][-1] == "left out as told: images 3, 7 to 9"
+    assert (record["images"], record["images_used"]) == (50, 46)
+    mask = np.ones(50, bool)
+    mask[[3, 7, 8, 9]] = False
+    images = replace(recording.calibration, mask=mask)
+    expected = jaxcal.calibrate(replace(recording, calibration=images), "conventional")
+    np.testing.assert_array_equal(record["image_plane_to_probe"], expected.image_to_probe)
+
+
 def test_calibrate_writes_the_whole_report(calibrated):
     done, folder = calibrated
     assert {path.name for path in folder.iterdir()} == REPORT
@@ -431,6 +444,10 @@ def test_refused_without_a_recording(arguments, said, capfd, tmp_path, monkeypat
         (["--estimate", ""], "cannot estimate ''"),
         (["--estimate", "scale"], "no pixel scale to estimate"),
         (["--estimate", "scale", "--out", "report/deep"], "no pixel scale to estimate"),
+        (["--leave-out", "2,x"], "'2,x' is no list of images, such as 11,12,20-25"),
+        (["--leave-out", "5-3"], "'5-3' is no list of images"),
+        (["--leave-out", "1,6"], "rec.h5: there is no image 6 to leave out: the 6 images have"),
+        (["--leave-out", "1-3"], "rec.h5: 3 used images are too few"),
         (["--test", "nope.h5"], "nope.h5: no such file"),
         (["--out", "/proc/nope"], "/proc/nope: cannot be made or written to"),
         (["--out", "rec.h5"], "rec.h5: is a file, not a folder"),

@@ -18,6 +18,7 @@ from jaxcal.cli.common import (
     POSITIVE,
     REQUIRED,
     WORDS,
+    ImageNumbers,
     import_engine,
     json_option,
     prepare_jax,
@@ -27,6 +28,7 @@ from jaxcal.cli.common import (
     segmented,
     verdict_code,
 )
+from jaxcal.runtime.messages import runs_in_words
 from jaxcal.solvers.names import Data, Method, PriorName, SolverName
 
 if TYPE_CHECKING:
@@ -91,6 +93,13 @@ EXPORTS: tuple[SaveFormat, ...] = ("plus", "slicer", "itk", "ros", "tusrec", "nu
     show_default=True,
     help="Find the images that agree with each other first, and leave the others out: wrong "
     "echoes, wrong clicks, a slipped mount.",
+)
+@click.option(
+    "--leave-out",
+    type=ImageNumbers(),
+    metavar="LIST",
+    help="Images that were looked at and found wrong, by the numbers of the report (from 0), e.g. "
+    "11,12,20-25. If images are chosen by their errors alone, the stated error is too small.",
 )
 @click.option(
     "--solver",
@@ -182,6 +191,7 @@ def calibrate(
     solver: SolverName | None,
     data: Data,
     robust: bool,
+    leave_out: tuple[int, ...] | None,
     test: str | None,
     cross_validate: bool,
     bootstrap: int | None,
@@ -228,6 +238,11 @@ def calibrate(
     from jaxcal.result.saved import dated
 
     measured, notes = segmented(load(recording))
+    if leave_out:
+        with naming(recording):
+            images = measured.calibration.without(leave_out)
+        measured = replace(measured, calibration=images)
+        notes.append(f"left out as told: images {runs_in_words(leave_out)}")
     test_data = None if test is None else segmented(load(test))[0]
     check_test_images(measured, test_data)
     _check_exports(measured, targets, inputs)

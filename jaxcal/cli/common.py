@@ -89,6 +89,25 @@ class Server(click.ParamType):
         return found[1].strip("[]"), port
 
 
+class ImageNumbers(click.ParamType):
+    """Numbers of images and ranges of them, separated by commas: 11,12,20-25."""
+
+    name = "numbers"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[int, ...]:
+        """The numbers in order, each once, or a usage error."""
+        found: set[int] = set()
+        for part in value.split(","):
+            ends = re.fullmatch(r"\s*([0-9]{1,6})(?:-([0-9]{1,6}))?\s*", part)
+            first, last = (int(ends[1]), int(ends[2] or ends[1])) if ends else (1, 0)
+            if last < first:
+                self.fail(f"{value!r} is no list of images, such as 11,12,20-25", param, ctx)
+            found.update(range(first, last + 1))
+        return tuple(sorted(found))
+
+
 POSITIVE = Number()
 NOT_NEGATIVE = Number(zero=True)
 CONE = Number(zero=True, largest=85.0)

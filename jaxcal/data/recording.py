@@ -106,6 +106,26 @@ class Images:
     def __len__(self) -> int:
         return len(self.poses)
 
+    def without(self, images: Sequence[int]) -> Images:
+        """The set without some images, which stay in the arrays and are not used.
+
+        Args:
+            images: their numbers, from 0, images that are not used included.
+
+        Raises:
+            InputError: a number of no image.
+        """
+        count = len(self)
+        for image in images:
+            if not (is_number(image) and int(image) == image and 0 <= image < count):
+                raise InputError(
+                    f"there is no image {shown(image)} to leave out: the {counted(count, 'image')} "
+                    f"have the numbers 0 to {count - 1}"
+                )
+        mask = self.mask.copy()
+        mask[np.asarray(images, int)] = False
+        return replace(self, mask=mask)
+
     def out_of_order(self) -> str | None:
         """In words, that many used images are older than the one before; None where few are.
 

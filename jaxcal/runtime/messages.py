@@ -17,6 +17,17 @@ def shown(value: object) -> str:
     return quoted(value) if isinstance(value, str) else quoted(repr(value))[1:-1]
 
 
+def runs_in_words(numbers: Sequence[int]) -> str:
+    """Ascending whole numbers, runs of them as their ends: ``3, 7 to 9``."""
+    runs: list[list[int]] = []
+    for number in numbers:
+        if runs and number == runs[-1][-1] + 1:
+            runs[-1].append(number)
+        else:
+            runs.append([number])
+    return ", ".join(str(run[0]) if len(run) == 1 else f"{run[0]} to {run[-1]}" for run in runs)
+
+
 def counted(count: int, noun: str, one: str = "", several: str = "") -> str:
     """A number with its noun and verb, ``1 image is`` or ``2 images are``."""
     return f"{count} {noun} {one}".rstrip() if count == 1 else f"{count} {noun}s {several}".rstrip()
