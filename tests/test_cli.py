@@ -446,7 +446,7 @@ def test_refused_without_a_recording(arguments, said, capfd, tmp_path, monkeypat
         (["--estimate", "scale", "--out", "report/deep"], "no pixel scale to estimate"),
         (["--leave-out", "2,x"], "'2,x' is no list of images, such as 11,12,20-25"),
         (["--leave-out", "5-3"], "'5-3' is no list of images"),
-        (["--leave-out", "1,6"], "rec.h5: there is no image 6 to leave out: the 6 images have"),
+        (["--leave-out", "1,6"], "rec.h5: the number of an image must be between 0 and 5, not 6"),
         (["--leave-out", "1-3"], "rec.h5: 3 used images are too few"),
         (["--test", "nope.h5"], "nope.h5: no such file"),
         (["--out", "/proc/nope"], "/proc/nope: cannot be made or written to"),

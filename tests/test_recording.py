@@ -93,6 +93,20 @@ def test_a_problem_of_arrays_has_the_range_of_row_zero():
         jaxcal.make_images(given["poses"], times, "time_of_flight", face_offset_mm=4.0)
 
 
+def test_images_are_left_out_by_their_numbers():
+    images = jaxcal.make_images(**arrays(), mask=np.arange(12) != 3)
+    np.testing.assert_array_equal(
+        np.flatnonzero(images.without(np.array([0, 3, 11])).mask), [1, 2, *range(4, 11)]
+    )
+    assert len(images.without([])) == 12
+    # A mask is no list of numbers: it would leave out images 0 and 1.
+    for bad, said in ((images.mask, "whole number"), ([12], "not 12"), ([-1], "not -1")):
+        with pytest.raises(InputError, match=said):
+            images.without(bad)
+    with pytest.raises(InputError, match="a list of numbers"):
+        images.without(np.array(3))
+
+
 def test_numbers_of_frames_are_whole():
     given = arrays()
     numbers = np.array([0, 2, 3, *range(9, 18)])

@@ -18,7 +18,13 @@ from jaxcal.data.poses import check_poses
 from jaxcal.data.probe import Probe, check_probe
 from jaxcal.runtime.array_types import Bool, Float, Int
 from jaxcal.runtime.arrays import is_traced
-from jaxcal.runtime.given_values import is_number, real_array, refuse_masked, truth_array
+from jaxcal.runtime.given_values import (
+    is_number,
+    real_array,
+    refuse_masked,
+    truth_array,
+    whole_number,
+)
 from jaxcal.runtime.messages import counted, shown
 
 MINIMUM_IMAGES = 4
@@ -106,24 +112,21 @@ class Images:
     def __len__(self) -> int:
         return len(self.poses)
 
-    def without(self, images: Sequence[int]) -> Images:
+    def without(self, images: Sequence[int] | np.ndarray) -> Images:
         """The set without some images, which stay in the arrays and are not used.
 
         Args:
             images: their numbers, from 0, images that are not used included.
 
         Raises:
-            InputError: a number of no image.
+            InputError: no list, and numbers of no image.
         """
-        count = len(self)
-        for image in images:
-            if not (is_number(image) and int(image) == image and 0 <= image < count):
-                raise InputError(
-                    f"there is no image {shown(image)} to leave out: the {counted(count, 'image')} "
-                    f"have the numbers 0 to {count - 1}"
-                )
+        if np.ndim(images) != 1:
+            raise InputError(f"images to leave out are a list of numbers, not {shown(images)}")
+        most = len(self) - 1
+        left_out = [whole_number("the number of an image", image, 0, most) for image in images]
         mask = self.mask.copy()
-        mask[np.asarray(images, int)] = False
+        mask[left_out] = False
         return replace(self, mask=mask)
 
     def out_of_order(self) -> str | None:
