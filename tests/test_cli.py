@@ -403,6 +403,7 @@ def test_a_degenerate_set_is_solved_but_not_observable(degenerate, capfd, tmp_pa
         (["import", "a.csv", "x.h5", "--spacing", "1", "0"], "'0' is not a positive number"),
         (["calibrate", "nope.h5"], "nope.h5: no such file"),
         (["calibrate", "/proc"], "/proc: is a directory"),
+        (["calibrate", "poses.txt", "points.txt"], "jaxcal import makes one, also from a file of"),
     ],
 )
 def test_refused_without_a_recording(arguments, said, capfd, tmp_path, monkeypatch):

@@ -41,8 +41,27 @@ if TYPE_CHECKING:
 EXPORTS: tuple[SaveFormat, ...] = ("plus", "slicer", "itk", "ros", "tusrec", "numpy")
 
 
+def _one_recording(
+    context: click.Context, parameter: click.Parameter, given: tuple[str, ...]
+) -> str:
+    if len(given) == 1:
+        return given[0]
+    raise click.UsageError(
+        f"one recording is calibrated, not {len(given)} files: jaxcal import makes one, also from "
+        "a file of poses and a file of points",
+        context,
+    )
+
+
 @click.command(short_help="Calibrate from a recording: transform, verdict, report.")
-@click.argument("recording", type=click.Path(), metavar="REC")
+@click.argument(
+    "recording",
+    type=click.Path(),
+    nargs=-1,
+    required=True,
+    callback=_one_recording,
+    metavar="REC",
+)
 @click.option(
     "--method",
     type=click.Choice(get_args(Method)),
