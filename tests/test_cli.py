@@ -26,6 +26,7 @@ import jaxcal
 from hw.cli.main import commands as bench_commands
 from hw.cli.main import main as bench_main
 from hw.runtime.errors import DeviceError
+from jaxcal import design
 from jaxcal.cli import common, demo, plan
 from jaxcal.cli.main import commands, main
 from jaxcal.cli.run import run
@@ -899,6 +900,21 @@ def test_plan_from_nothing_is_words_and_counts(capfd):
     assert out.count("target") >= 6
 
 
+def test_the_sector_of_a_curvilinear_probe_is_not_told_as_a_rectangle(capfd):
+    probe = jaxcal.CurvilinearProbe()
+    region = design.Region.of_probe(probe, lateral_mm=(-20.0, 20.0))
+    model = design.Model(noise=design.Noise.constant((0.02, 0.02, 0.02)))
+    candidates = design.make_candidates(probe, region, count=100, model=model)
+    found = design.plan(candidates, 6, polish=False)
+    record = plan._record(found, None, region, None)
+    plan._print(found, record, None, None)
+    out = capfd.readouterr().out
+    assert "Target 15 to 82 mm from the array, in front of its arc from -20 to 20 mm." in out
+    assert record["region"]["radius_mm"] == probe.radius_mm
+    # The table's lateral positions are straight, and so beyond these limits.
+    assert max(abs(pose["target_mm"][0]) for pose in record["poses"]) > 30
+
+
 def test_a_plan_is_tried_in_simulated_recordings(capfd):
     arguments = ["plan", "--images", 24, "--sigma", 0.1, 0.1, 1]
     arguments += ["--simulate", "normal", "--simulate", "uniform"]
@@ -924,7 +940,8 @@ def test_plans_that_cannot_be(capfd, tmp_path):
         (["--images", 10, "--cone", 0, "--turn", 0], "would not determine"),
         (["--estimate", "scale"], "needs a recording"),
         (["--depth", 80, 20], "in order"),
-        (["--lateral", 30], "reaches 29.2 mm to either side"),
+        (["--lateral", 30], "the image of this probe reaches 29.2 mm to either side"),
+        (["--probe", "curvilinear", "--lateral", 40], "the arc of this probe reaches 3"),
         (["--images", 2], "between 4 and"),
         (["--depth", 0.02, 0.05], "the far one 1 to 5000, not (0.02, 0.05)"),
         (["--lateral", 0.02], "--lateral is in mm, and 0.02 is too small: was it in metres?"),

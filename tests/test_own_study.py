@@ -226,6 +226,27 @@ def test_a_file_names_the_versions_that_computed_it_not_those_that_wrote_it(tmp_
     assert store.versions(chunk) == "jaxcal 9.9.9, jax 8.8.8, 4 x gpu"
 
 
+def test_chunks_of_another_version_are_told_of_when_they_are_continued(tmp_path, squares):
+    """Not only by the next run, which may never come."""
+    study, notes = squares(), []
+    store = Store(tmp_path / "study", study)
+    run_study(study, store.folder)
+    maker = {"jaxcal": "9.9.9", "jax": "8.8.8", "device": "4 x gpu"}
+    for index in (0, 1):
+        store.write(study.chunk(index), store.read(study.chunk(index)), maker)
+    store.path(study.chunk(2)).unlink()
+
+    class Notes(Silence):
+        def note(self, message):
+            notes.append(message)
+
+    assert run_study(study, store.folder, resume=True, watcher=Notes()).computed == 1
+    assert len(notes) == 1
+    assert "2 different set-ups: " in notes[0]
+    for versions in ("jaxcal 9.9.9, jax 8.8.8, 4 x gpu", store.versions(study.chunk(2))):
+        assert versions in notes[0]
+
+
 def test_ctrl_c_in_a_destructor_interrupts_a_study_called_from_python(squares, tmp_path):
     """Python drops what destructors raise; the study is interrupted all the same, and resumed."""
 

@@ -90,14 +90,15 @@ _PICTURES = (
     type=POSITIVE,
     nargs=2,
     metavar="NEAR FAR",
-    help="Range of the target, mm.  [default: 15 82; with REC where it was]",
+    help="Range of the target from the array, mm.  [default: 15 82; with REC where it was]",
 )
 @click.option(
     "--lateral",
     type=POSITIVE,
     metavar="MM",
     help="Largest lateral position of the target, to either side of the middle (in pixels, of the "
-    "middle of where it was).  [default: 0.41 of the aperture; with REC where it was]",
+    "middle of where it was; of a curvilinear probe, along its arc).  [default: 0.41 of the "
+    "aperture; with REC where it was]",
 )
 @click.option(
     "--cone",
@@ -247,13 +248,14 @@ def _from_nothing(
     seed: int,
 ) -> Candidates:
     from jaxcal import design
-    from jaxcal.data.probe import PRESETS
+    from jaxcal.data.probe import PRESETS, LinearProbe
 
     transducer = PRESETS[probe]
     half = 0.5 * transducer.width_mm
     if lateral is not None and lateral > half:
+        what = "image" if isinstance(transducer, LinearProbe) else "arc"
         raise InputError(
-            f"--lateral {lateral:g}: the image of this probe reaches {half:.1f} mm to either side"
+            f"--lateral {lateral:g}: the {what} of this probe reaches {half:.1f} mm to either side"
         )
     bounds = design.Constraints(
         region=_region(design.Region.of_probe(transducer), depth, lateral),
@@ -345,7 +347,11 @@ def _record(
     return {
         "source": recording,
         "criterion": found.criterion,
-        "region": {"depth_mm": list(region.depth_mm), "lateral_mm": list(region.lateral_mm)},
+        "region": {
+            "depth_mm": list(region.depth_mm),
+            "lateral_mm": list(region.lateral_mm),
+            "radius_mm": region.radius_mm,
+        },
         "images_before": found.known.images,
         "tre_mm": found.tre_mm.tolist(),
         "rp_mm": found.rp_mm.tolist(),
@@ -377,6 +383,9 @@ def _print(
         for wanted, count in record["images_to_tre_mm"].items()
     ]
     (near, far), (left, right) = (record["region"][k] for k in ("depth_mm", "lateral_mm"))
+    # Of a sector, neither is what the table says of a target beside the middle.
+    curved = record["region"]["radius_mm"] is not None
+    extent = "from the array, in front of its arc" if curved else "deep, laterally"
     total = "" if not there else ", the existing ones included,"
     before = "" if not there else f" added to the {there} existing ones"
     reached: list[str] = []
@@ -386,7 +395,7 @@ def _print(
     these = "this image" if len(found) == 1 else f"these {len(found)} images"
     print_page(
         table,
-        f"Target {near:.0f} to {far:.0f} mm deep, laterally from {left:.0f} to {right:.0f} mm.",
+        f"Target {near:.0f} to {far:.0f} mm {extent} from {left:.0f} to {right:.0f} mm.",
         "Tilts and turns from the middle orientation, with the marker to your right; left is where "
         "the lateral position is smallest. Take them in any order.",
         *reached,

@@ -36,7 +36,7 @@ _TOKEN = re.compile(
     r"|(?P<open>[\"'])"
     r"|(?P<comment>\#[^\n]*)"
     r"|(?P<word>[^\s\[\]{}=,.\"'#]+)"
-    r"|(?P<mark>[\[\]{}=.])"
+    r"|(?P<mark>[\[\]{}=.,])"
     r"|(?P<line>\n)",
     re.DOTALL,
 )
@@ -82,7 +82,7 @@ def _check(text: str) -> None:
             what = "a number" if found.lstrip("+-")[:1].isdigit() else "a name"
             raise _refused(line, f"{what} of {len(found)} characters", LONGEST_WORD)
         if kind == "mark":
-            # A dot continues a key (or a number); any other mark ends it.
+            # A dot continues a key (or a number); any other mark, a comma included, ends it.
             parts = parts + 1 if found == "." else 1
             keys += found == "=" or (found == "[" and deep == 0)
             deep = max(0, deep + (found in "[{") - (found in "]}"))

@@ -18,7 +18,7 @@ from jaxcal.runtime.interrupts import no_interrupt_lost
 from jaxcal.runtime.messages import shown
 from jaxcal.study.cluster import compute_on_cluster, connected
 from jaxcal.study.interface import Chunk, Results, Study, computed
-from jaxcal.study.store import Store
+from jaxcal.study.store import Store, versions_in_words
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -114,20 +114,23 @@ def run_study(
         with _locked(store.folder):
             store.begin(resume=resume)
             store.sweep()
-            missing, done = _missing(store, watcher)
+            missing, done, makers = _missing(store, watcher)
             watcher.begin(spec.condition_count * spec.trials, done)
             trials = 0
             with closing(_computed(spec, missing, workers, client, watcher)) as results:
                 for chunk, arrays, maker in results:
                     store.write(chunk, arrays, maker)
+                    if (found := versions_in_words(maker)) not in makers:
+                        makers.add(found)
+                        _note_makers(makers, watcher)
                     trials += chunk.stop - chunk.start
                     watcher.advance(chunk.stop - chunk.start)
     return RunSummary(spec.chunk_count, len(missing), trials, time.monotonic() - begun)
 
 
-def _missing(store: Store, watcher: Watcher) -> tuple[list[Chunk], int]:
-    """The chunks to compute, and how many trials are done."""
-    sound, done, makers = set(), 0, {}
+def _missing(store: Store, watcher: Watcher) -> tuple[list[Chunk], int, set[str]]:
+    """The chunks to compute, how many trials are done, and what computed these, in words."""
+    sound, done, makers = set(), 0, set()
     for index in store.present():
         chunk = store.spec.chunk(index)
         try:
@@ -135,16 +138,20 @@ def _missing(store: Store, watcher: Watcher) -> tuple[list[Chunk], int]:
         except FormatError as error:
             watcher.note(f"{error}; it is computed again")
             continue
-        makers.setdefault(store.versions(chunk), []).append(index)
+        makers.add(store.versions(chunk))
         sound.add(index)
         done += chunk.stop - chunk.start
     missing = [store.spec.chunk(k) for k in range(store.spec.chunk_count) if k not in sound]
+    _note_makers(makers, watcher)
+    return missing, done, makers
+
+
+def _note_makers(makers: set[str], watcher: Watcher) -> None:
     if len(makers) > 1:
         watcher.note(
             f"the chunks were computed by {len(makers)} different set-ups: "
             f"{'; '.join(sorted(makers))}"
         )
-    return missing, done
 
 
 def _computed(

@@ -37,6 +37,9 @@ from jaxcal.study.spec import Spec
 FORMAT = "jaxcal-study-chunk"
 VERSION = 1
 
+_MAKER = ("jaxcal", "jax", "device")
+"""Attributes that say what computed a file."""
+
 
 S = TypeVar("S", bound=Study)
 
@@ -183,8 +186,7 @@ class Store(Generic[S]):
     def versions(self, chunk: Chunk) -> str:
         """What computed a chunk: versions and device, in words."""
         with open_root(self.path(chunk)) as root:
-            parts = [text(root, name) or "?" for name in ("jaxcal", "jax", "device")]
-        return f"jaxcal {parts[0]}, jax {parts[1]}, {parts[2]}"
+            return versions_in_words({name: text(root, name) or "?" for name in _MAKER})
 
     @property
     def _spec_path(self) -> Path:
@@ -225,6 +227,12 @@ def read_spec(folder: str | os.PathLike[str], kind: type[Any] = Spec) -> Any:
             f"{path}: is no {kind.__name__}: damaged, of another version of jaxcal, or a study of "
             "another class"
         ) from None
+
+
+def versions_in_words(maker: dict[str, str]) -> str:
+    """What computed a chunk (:func:`jaxcal.study.interface.made_by`), in words."""
+    jaxcal, jax, device = (maker[name] for name in _MAKER)
+    return f"jaxcal {jaxcal}, jax {jax}, {device}"
 
 
 def _place(chunk: Chunk) -> dict[str, int]:

@@ -260,10 +260,12 @@ def test_numbers_that_are_none_or_too_large_are_one_line(tmp_path, capsys, value
 def test_toml_with_all_that_toml_has_is_read():
     text = (
         'a = """x [[[ "" """""\nb.c."d.e.f.g.h.i.j" = 1.5 # """ [[[\r\n'
-        "c = '''[\n{'''\nd = [[[1]]]"
+        "c = '''[\n{'''\nd = [[[1]]]\n"
+        "e = [0.5, 1.5, 2.5, 3.5, 4.5, 5.5, 6.5, 7.5, 8.5]"
     )
     assert parse_toml(text) == {
-        "a": 'x [[[ "" ""', "b": {"c": {"d.e.f.g.h.i.j": 1.5}}, "c": "[\n{", "d": [[[1]]]
+        "a": 'x [[[ "" ""', "b": {"c": {"d.e.f.g.h.i.j": 1.5}}, "c": "[\n{", "d": [[[1]]],
+        "e": [k + 0.5 for k in range(9)],
     }  # fmt: skip
 
 
