@@ -48,6 +48,19 @@ def test_record_in_memory_is_the_command_lines(result, recording):
         assert mine[name] == theirs[name], name
 
 
+def test_what_is_read_again_is_not_computed_again(result, recording):
+    answer = result.numpy()
+    assert answer is not result  # JAX is imported here, and result holds its arrays
+    assert answer.numpy() is answer is result.numpy()
+    assert answer.inspection is result.inspection
+    images = recording.calibration
+    inverted = replace(images, poses=np.linalg.inv(images.poses))
+    wrong = jaxcal.calibrate(inverted, "conventional")
+    assert "invert them" in wrong.wrong_frames
+    # Equal texts that were put together twice would be two objects.
+    assert wrong.wrong_frames is wrong.numpy().wrong_frames
+
+
 def test_saved_by_the_name_of_the_recordings_frame(result, tmp_path):
     assert result.record()["pose_frames"] == {"from": "US_Probe", "to": "Reference"}
     for extension in ("json", "npz"):

@@ -329,19 +329,16 @@ class Calibration:
         Raises:
             CalibrationError: under jit, vmap or grad, where there is no text: use ``status_code``.
         """
-        return status_names(self._concrete(self.status_code))
+        _refuse_traced(self.status_code)
+        return status_names(np.asarray(self.status_code))
 
     @cached_property
     def _summary(self) -> Summary:
         """The diagnostics, computed when one of them is first read."""
         from jaxcal.diagnostics.summary import summarise
 
-        if is_traced(self):
-            raise CalibrationError(
-                "diagnostics are computed on the host and are not there under jit, vmap or grad: "
-                "read them outside; status_code, converged and covariance are there"
-            )
-        return summarise(self)
+        answer = self.numpy()
+        return summarise(self) if answer is self else answer._summary
 
     @property
     def elevation_sd(self) -> Float[np.ndarray, "*batch n"]:
@@ -412,7 +409,9 @@ class Calibration:
         """
         from jaxcal.diagnostics.frame_checks import wrong_frames
 
-        check_one(self._concrete(self.status_code))
+        check_one(self.status_code)
+        if (answer := self.numpy()) is not self:
+            return answer.wrong_frames
         if self.problem is None:
             return None
         return wrong_frames(replace(self.problem, mask=self.mask), self.blocks)
@@ -429,7 +428,9 @@ class Calibration:
         """
         from jaxcal.diagnostics.frame_checks import doubtful_unit
 
-        check_one(self._concrete(self.status_code))
+        check_one(self.status_code)
+        if (answer := self.numpy()) is not self:
+            return answer.doubtful_unit
         if self.problem is None or self.wrong_frames is not None:
             return None
         return doubtful_unit(replace(self.problem, mask=self.mask))
@@ -629,24 +630,38 @@ class Calibration:
         return complete and not is_traced(self)
 
     def numpy(self) -> Calibration:
-        """The same calibration with numpy arrays (concrete values).
+        """The same calibration with numpy arrays (concrete values); itself if it has no others.
+
+        It is the same object every time, so that diagnostics are computed once.
 
         Raises:
             CalibrationError: under a JAX transformation.
         """
-        found = map_arrays(self._concrete, self)
-        if "_summary" in vars(self):
-            vars(found)["_summary"] = self._summary
-        return found
+        _refuse_traced(self)
+        return self._in_numpy or self
 
-    @staticmethod
-    def _concrete(value: AnyArray) -> np.ndarray:
-        if is_traced(value):
-            raise CalibrationError(
-                "texts, and what is computed by numpy, are not available under jit, vmap or grad: "
-                "use the arrays (status_code, converged, ...) there, and the rest outside"
-            )
-        return np.asarray(value)
+    @cached_property
+    def _in_numpy(self) -> Calibration | None:
+        """The calibration with numpy arrays; None if it has no others."""
+        others: list[AnyArray] = []
+
+        def converted(leaf: AnyArray) -> np.ndarray:
+            values = np.asarray(leaf)
+            if values is not leaf:
+                others.append(leaf)
+            return values
+
+        found = map_arrays(converted, self)
+        return found if others else None
+
+
+def _refuse_traced(value: Any) -> None:
+    """Raise CalibrationError for what a JAX transformation traces."""
+    if is_traced(value):
+        raise CalibrationError(
+            "texts, and what is computed by numpy, are not available under jit, vmap or grad: use "
+            "the arrays (status_code, converged, ...) there, and the rest outside"
+        )
 
 
 def status_names(status_code: Int[np.ndarray, "*batch"]) -> str | np.ndarray:
