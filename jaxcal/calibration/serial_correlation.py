@@ -40,7 +40,7 @@ from jaxcal.diagnostics.influence import WhitenedErrors, whitened_errors
 from jaxcal.model.unknowns import block_slice
 from jaxcal.result.calibration import Calibration, Medium
 from jaxcal.runtime.array_types import Float
-from jaxcal.runtime.arrays import like, map_arrays
+from jaxcal.runtime.arrays import batch_of_one, like
 
 CORRELATIONS = np.arange(0.04, 1.0, 0.08)
 """Correlations of the correlated part of successive errors that are weighed."""
@@ -83,7 +83,7 @@ def widened(result: Calibration) -> Calibration:
         return result
     if np.max(np.asarray(result.sigma)) < ROUNDING_MM:
         return result
-    answer = map_arrays(lambda leaf: np.asarray(leaf)[None], result)
+    answer = batch_of_one(result)
     whitened = whitened_errors(answer)
     before, after = _covariances(whitened, further_prior(answer)[0])
     linearisation = result.linearisation

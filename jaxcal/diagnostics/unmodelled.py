@@ -45,7 +45,7 @@ from jaxcal.diagnostics.second_target import FEWEST as FEWEST_OF_TWO
 from jaxcal.diagnostics.second_target import second_target
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Bool, Float
-from jaxcal.runtime.arrays import map_arrays
+from jaxcal.runtime.arrays import batch_of_one
 from jaxcal.solvers.plan import TUNED
 
 Array = np.ndarray
@@ -140,7 +140,7 @@ def unmodelled(calibration: Calibration) -> list[Unmodelled]:
     points = calibration.data == "points"
     if calibration.problem is None or not points or used.sum() < fewest:
         return []
-    answer = map_arrays(lambda leaf: np.asarray(leaf)[None], calibration.numpy())
+    answer = batch_of_one(calibration.numpy())
     if calibration.prior in TUNED:
         seen = ImageErrors.of_answer(answer).centred(answer)
     else:
