@@ -40,9 +40,9 @@ from jaxcal.model.unknowns import (
     stepped,
 )
 from jaxcal.report.accuracy import FAIR_MM, GOOD_MM, region_of, settle
+from jaxcal.report.in_memory import record_of, recording_of
 from jaxcal.report.next_poses import next_poses_sentences, pose_records
 from jaxcal.report.record import _precision, calibration_record
-from jaxcal.report.summary import record_of, recording_of
 from jaxcal.report.tables import calibration_table
 from jaxcal.report.verdict import headline, limits, verdict
 from jaxcal.result.saved import load_calibration

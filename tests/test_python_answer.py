@@ -120,7 +120,7 @@ def test_debuggers_and_lists_of_a_notebook_show_no_arrays(recording):
     assert repr(batch) == "Calibration(conventional, batch of 2: 2 converged)"
     assert str(replace(result, problem=None)) == repr(result)
     assert "information=float64[9,9], design=float64[9,9]" in repr(result.linearisation)
-    assert f"Summary(elevation_sd=float64[{n}]" in repr(result._summary)
+    assert f"Diagnostics(elevation_sd=float64[{n}]" in repr(result._diagnostics)
     assert f"Inspection(outlier=float64[{n}]" in repr(result.inspection)
     points = np.ones((20, 2))
     assert repr(result.apply(points)) == (

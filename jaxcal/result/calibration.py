@@ -15,7 +15,7 @@ from jaxcal.data.probe import Probe
 from jaxcal.data.problem import Problem
 from jaxcal.model.distributions import OffsetLaw
 from jaxcal.model.unknowns import TABLE, Blocks, Values, block_slice, in_image, with_prior
-from jaxcal.result.findings import Inspection, Summary
+from jaxcal.result.diagnostics import Diagnostics, Inspection
 from jaxcal.result.saved import check_target, dated
 from jaxcal.result.transform import AppliedPoints, ImageTransform, SaveFormat
 from jaxcal.runtime.array_types import AnyArray, Bool, Float, Int
@@ -333,42 +333,42 @@ class Calibration:
         return status_names(np.asarray(self.status_code))
 
     @cached_property
-    def _summary(self) -> Summary:
+    def _diagnostics(self) -> Diagnostics:
         """The diagnostics, computed when one of them is first read."""
-        from jaxcal.diagnostics.summary import summarise
+        from jaxcal.diagnostics.diagnose import diagnose
 
         answer = self.numpy()
-        return summarise(self) if answer is self else answer._summary
+        return diagnose(self) if answer is self else answer._diagnostics
 
     @property
     def elevation_sd(self) -> Float[np.ndarray, "*batch n"]:
         """SD of ``elevation``, mm; NaN where an offset rests on its bound or is not known."""
-        return self._summary.elevation_sd
+        return self._diagnostics.elevation_sd
 
     @property
     def residual(self) -> Float[np.ndarray, "*batch n 3"]:
         """q_i - p_i with p_i in the plane (y = 0), in the image frame, mm."""
-        return self._summary.residual
+        return self._diagnostics.residual
 
     @property
     def at_bound(self) -> Float[np.ndarray, "*batch n"]:
         """1 where the offset rests on its bound."""
-        return self._summary.at_bound
+        return self._diagnostics.at_bound
 
     @property
     def condition(self) -> Float[np.ndarray, "*batch"]:
         """Largest over smallest eigenvalue of all unknowns' information, in scaled units."""
-        return self._summary.condition
+        return self._diagnostics.condition
 
     @property
     def weakest(self) -> Float[np.ndarray, "*batch p"]:
         """Unit vector (scaled units) of the least well determined direction of all unknowns."""
-        return self._summary.weakest
+        return self._diagnostics.weakest
 
     @property
     def weakest_sd(self) -> Float[np.ndarray, "*batch"]:
         """SD along ``weakest``, mm at the lever arm; NaN where there is no finite SD."""
-        return self._summary.weakest_sd
+        return self._diagnostics.weakest_sd
 
     @property
     def prior_direction(self) -> Float[np.ndarray, "*batch p"]:
@@ -376,17 +376,17 @@ class Calibration:
 
         It is a unit vector in scaled units; zeros where there is no such direction.
         """
-        return self._summary.prior_direction
+        return self._diagnostics.prior_direction
 
     @property
     def inspection(self) -> Inspection:
         """Images that stand out, the noise model's fit, and which poses to add."""
-        return self._summary.inspection
+        return self._diagnostics.inspection
 
     @property
     def outlier(self) -> Float[np.ndarray, "*batch n"]:
         """1 where an image does not fit the rest; a robust solve leaves it out."""
-        return self._summary.inspection.outlier
+        return self._diagnostics.inspection.outlier
 
     @property
     def studentised_errors(self) -> Float[np.ndarray, "*batch n 3"]:
@@ -394,7 +394,7 @@ class Calibration:
 
         They are corrected for leverage.
         """
-        return self._summary.inspection.studentised_errors
+        return self._diagnostics.inspection.studentised_errors
 
     @cached_property
     def wrong_frames(self) -> str | None:
@@ -522,7 +522,7 @@ class Calibration:
         Args:
             tre_points: further image points, in the images' unit, for which to give the error.
         """
-        from jaxcal.report.summary import record_of
+        from jaxcal.report.in_memory import record_of
 
         return record_of(self, tre_points)
 
@@ -560,8 +560,8 @@ class Calibration:
             InputError: the file exists and is no such page, or is not named .html.
             OutputError: it could not be written and is unchanged.
         """
+        from jaxcal.report.in_memory import recording_of
         from jaxcal.report.page import write_page
-        from jaxcal.report.summary import recording_of
 
         write_page(path, dated(self.record()), self, recording_of(self))
 
@@ -610,17 +610,17 @@ class Calibration:
         """Table and verdict; for a batch how many converged; without data or values, the repr."""
         if not self._is_complete():
             return repr(self)
-        from jaxcal.report import summary
+        from jaxcal.report import in_memory
 
         if np.ndim(self.mask) != 1:
-            return summary.batch_text(self)
-        return summary.text_of(self)
+            return in_memory.batch_text(self)
+        return in_memory.text_of(self)
 
     def _repr_html_(self) -> str | None:
         """HTML for notebooks; None, so that the text is shown, if there is nothing to draw."""
         if not self._is_complete() or np.ndim(self.mask) != 1:
             return None
-        from jaxcal.report.summary import html_of
+        from jaxcal.report.in_memory import html_of
 
         return html_of(self)
 
