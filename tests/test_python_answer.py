@@ -86,8 +86,12 @@ def test_batches_and_traces_print_without_a_verdict(recording):
     one = jaxcal.calibrate(problem, "conventional")
     np.testing.assert_allclose(batch.image_to_probe[1], one.image_to_probe, atol=1e-9)
     assert [each.status for each in batch] == ["converged"] * 2
+    assert len(batch) == len(list(batch)) == 2
+    assert all([one, batch, batch[:0]])
     with pytest.raises(jaxcal.InputError, match="one calibration, not a batch"):
         list(one)
+    with pytest.raises(jaxcal.InputError, match="one calibration, not a batch"):
+        len(one)
     with pytest.raises(jaxcal.InputError, match="take one of them"):
         batch.verdict()
     seen = []

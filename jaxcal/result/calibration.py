@@ -456,8 +456,7 @@ class Calibration:
             IndexError: beyond the batch.
             InputError: for one calibration, so that a loop over it does not end silently.
         """
-        if self.mask.ndim == 1:
-            raise InputError("this is one calibration, not a batch of them: it has no parts")
+        self._check_batch()
         # Numpy raises an error for an index outside the batch; JAX would clip it.
         np.empty(self.mask.shape[:-1])[index]
 
@@ -466,6 +465,23 @@ class Calibration:
             return np.asarray(leaf[index]) if isinstance(leaf, np.ndarray) else leaf[index]
 
         return map_arrays(taken, self)
+
+    def __len__(self) -> int:
+        """Number of calibrations along the first axis of a batch.
+
+        Raises:
+            InputError: for one calibration.
+        """
+        self._check_batch()
+        return self.mask.shape[0]
+
+    def __bool__(self) -> bool:
+        """True, also for an empty batch, and for one calibration, which has no length."""
+        return True
+
+    def _check_batch(self) -> None:
+        if self.mask.ndim == 1:
+            raise InputError("this is one calibration, not a batch of them: it has no parts")
 
     def with_problem(self, problem: Problem) -> Calibration:
         """The same calibration with the data that were solved."""
