@@ -40,13 +40,14 @@ from jaxcal.model.unknowns import (
     stepped,
 )
 from jaxcal.report.accuracy import FAIR_MM, GOOD_MM, region_of, settle
+from jaxcal.report.in_memory import record_of, recording_of
 from jaxcal.report.next_poses import next_poses_sentences, pose_records
 from jaxcal.report.record import _precision, calibration_record
-from jaxcal.report.summary import record_of, recording_of
 from jaxcal.report.tables import calibration_table
 from jaxcal.report.verdict import headline, limits, verdict
 from jaxcal.result.saved import load_calibration
 from jaxcal.result.transform import ImageTransform
+from jaxcal.runtime.arrays import batch_of_one
 from jaxcal.solvers.closed_form.calibrate import calibrate_closed_form
 
 POINTS = np.array([[5.0, 30.0], [55.0, 80.0], [30.0, 50.0]])
@@ -277,7 +278,7 @@ def test_whitened_errors_are_those_of_the_solve(tracker_sd):
     recording = jaxcal.simulate_recording(jaxcal.Protocol(images=12), 3)
     result = jaxcal.calibrate(recording, "joint", "gaussian", **given)
     assert float(result.cost) == pytest.approx(sum_of_squares(result, **given), rel=1e-9)
-    alone = jax.tree.map(influences._first, result.numpy())
+    alone = batch_of_one(result.numpy())
     whitened = influences.whitened_errors(alone)
     information = np.einsum("mkp,mkq->pq", whitened.rows, whitened.rows)
     size = np.sqrt(np.diagonal(information))

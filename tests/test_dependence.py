@@ -9,7 +9,6 @@ from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -33,6 +32,7 @@ from jaxcal.diagnostics import frame_checks
 from jaxcal.diagnostics.influence import WhitenedErrors, influence_of, whitened_errors
 from jaxcal.report.accuracy import GOOD_MM
 from jaxcal.report.record import calibration_record, further_unknowns
+from jaxcal.runtime.arrays import batch_of_one
 
 
 @pytest.fixture(scope="module")
@@ -313,7 +313,7 @@ def correlated(frames):
     problem = jaxcal.Problem.from_arrays(made.poses[::30], made.points[::30])
     wide = jaxcal.calibrate(problem, "conventional", estimate="sound-speed")
     assert not wide.notes
-    errors = whitened_errors(jax.tree.map(lambda leaf: np.asarray(leaf)[None], wide))
+    errors = whitened_errors(batch_of_one(wide))
     plain = errors.covariances(np.zeros(10))[1]
     assert np.trace(wide.covariance) > 1.2 * np.trace(plain[:6, :6])
     return wide, plain

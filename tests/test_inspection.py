@@ -23,7 +23,7 @@ from jaxcal.model.observations import Points
 from jaxcal.model.parameters import Parameters
 from jaxcal.model.residuals import target_in_image
 from jaxcal.model.unknowns import RIGID
-from jaxcal.result.findings import MISFITS
+from jaxcal.result.diagnostics import MISFITS
 from jaxcal.solvers.levenberg_marquardt import minimise
 
 SIGMA = np.array([0.4, 0.3, 1.0])

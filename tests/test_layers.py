@@ -51,14 +51,14 @@ LAYERS = {
 ANSWERS = {
     # What a user asks of an answer is found out, told, drawn and written above it.
     "jaxcal.result.calibration": {
+        "jaxcal.diagnostics.diagnose",
         "jaxcal.diagnostics.directions",
         "jaxcal.diagnostics.frame_checks",
         "jaxcal.diagnostics.intervals",
-        "jaxcal.diagnostics.summary",
         "jaxcal.diagnostics.warnings",
+        "jaxcal.report.in_memory",
         "jaxcal.report.page",
         "jaxcal.report.plots",
-        "jaxcal.report.summary",
         "jaxcal.report.verdict",
         "jaxcal.report.write",
     },

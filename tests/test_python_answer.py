@@ -48,6 +48,19 @@ def test_record_in_memory_is_the_command_lines(result, recording):
         assert mine[name] == theirs[name], name
 
 
+def test_what_is_read_again_is_not_computed_again(result, recording):
+    answer = result.numpy()
+    assert answer is not result  # JAX is imported here, and result holds its arrays
+    assert answer.numpy() is answer is result.numpy()
+    assert answer.inspection is result.inspection
+    images = recording.calibration
+    inverted = replace(images, poses=np.linalg.inv(images.poses))
+    wrong = jaxcal.calibrate(inverted, "conventional")
+    assert "invert them" in wrong.wrong_frames
+    # Equal texts that were put together twice would be two objects.
+    assert wrong.wrong_frames is wrong.numpy().wrong_frames
+
+
 def test_saved_by_the_name_of_the_recordings_frame(result, tmp_path):
     assert result.record()["pose_frames"] == {"from": "US_Probe", "to": "Reference"}
     for extension in ("json", "npz"):
@@ -73,8 +86,12 @@ def test_batches_and_traces_print_without_a_verdict(recording):
     one = jaxcal.calibrate(problem, "conventional")
     np.testing.assert_allclose(batch.image_to_probe[1], one.image_to_probe, atol=1e-9)
     assert [each.status for each in batch] == ["converged"] * 2
+    assert len(batch) == len(list(batch)) == 2
+    assert all([one, batch, batch[:0]])
     with pytest.raises(jaxcal.InputError, match="one calibration, not a batch"):
         list(one)
+    with pytest.raises(jaxcal.InputError, match="one calibration, not a batch"):
+        len(one)
     with pytest.raises(jaxcal.InputError, match="take one of them"):
         batch.verdict()
     seen = []
@@ -107,7 +124,7 @@ def test_debuggers_and_lists_of_a_notebook_show_no_arrays(recording):
     assert repr(batch) == "Calibration(conventional, batch of 2: 2 converged)"
     assert str(replace(result, problem=None)) == repr(result)
     assert "information=float64[9,9], design=float64[9,9]" in repr(result.linearisation)
-    assert f"Summary(elevation_sd=float64[{n}]" in repr(result._summary)
+    assert f"Diagnostics(elevation_sd=float64[{n}]" in repr(result._diagnostics)
     assert f"Inspection(outlier=float64[{n}]" in repr(result.inspection)
     points = np.ones((20, 2))
     assert repr(result.apply(points)) == (

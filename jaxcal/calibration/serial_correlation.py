@@ -40,7 +40,7 @@ from jaxcal.diagnostics.influence import WhitenedErrors, whitened_errors
 from jaxcal.model.unknowns import block_slice
 from jaxcal.result.calibration import Calibration, Medium
 from jaxcal.runtime.array_types import Float
-from jaxcal.runtime.arrays import like, map_arrays
+from jaxcal.runtime.arrays import batch_of_one, like
 
 CORRELATIONS = np.arange(0.04, 1.0, 0.08)
 """Correlations of the correlated part of successive errors that are weighed."""
@@ -83,7 +83,7 @@ def widened(result: Calibration) -> Calibration:
         return result
     if np.max(np.asarray(result.sigma)) < ROUNDING_MM:
         return result
-    answer = map_arrays(lambda leaf: np.asarray(leaf)[None], result)
+    answer = batch_of_one(result)
     whitened = whitened_errors(answer)
     before, after = _covariances(whitened, further_prior(answer)[0])
     linearisation = result.linearisation
@@ -181,33 +181,51 @@ def _factors(
     weight = np.tile(np.eye(1, len(spectra)), (kinds, 1))
     variance = np.ones((kinds, len(spectra)))
 
-    def profile(k: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Cost, leverage and weighed squares of the errors of kind k, under all its spectra."""
-        others = np.tensordot(weight / variance, weighed, ((0, 1), (0, 1)))
-        mine = np.tensordot(weight[k] / variance[k], weighed[k], 1)
-        joint = whole + others - mine + weighed[k] / variance[k][:, None, None]
-        information, gradient = joint[:, :-1, :-1], joint[:, :-1, -1:]
-        step = np.linalg.solve(information, gradient)
-        with_error = np.concatenate([-step, np.ones_like(step[:, :1])], axis=1)
-        squares = np.einsum("gpi,gpq,gqi->g", with_error, weighed[k], with_error)
-        leverage = np.trace(np.linalg.solve(information, weighed[k][:, :-1, :-1]), axis1=1, axis2=2)
-        cost = np.linalg.slogdet(information)[1] + joint[:, -1, -1]
-        return cost - np.sum(gradient * step, axis=(1, 2)), leverage / variance[k], squares
-
     for _ in range(ROUNDS):
         for k in range(kinds):
+            precision = weight / variance
+            precision[k] = 0.0
+            others = whole + np.tensordot(precision, weighed, 2)
             for _ in range(STEPS):
-                _, leverage, squares = profile(k)
-                variance[k] = squares / np.maximum(count - leverage, 0.1 * count)
+                joint = others + weighed[k] / variance[k][:, None, None]
+                leverage, squares = _leverage_and_squares(joint, weighed[k])
+                freedom = count - leverage / variance[k]
+                variance[k] = squares / np.maximum(freedom, 0.1 * count)
                 if not variance[k][0] > NEGLIGIBLE:
                     break
             if not variance[k][0] > NEGLIGIBLE:
                 variance[k] = 1.0
                 continue
-            twice = profile(k)[0] + count * np.log(variance[k]) + log_det
+            cost = _restricted_cost(others + weighed[k] / variance[k][:, None, None])
+            twice = cost + count * np.log(variance[k]) + log_det
             likelihood = before * np.exp(-0.5 * (twice - twice.min()))
             weight[k] = likelihood / likelihood.sum()
     return weight * variance / variance[:, :1]
+
+
+def _leverage_and_squares(
+    joint: Float[np.ndarray, "g q q"], own: Float[np.ndarray, "g q q"]
+) -> tuple[Float[np.ndarray, " g"], Float[np.ndarray, " g"]]:
+    """tr(S^-1 J_k' C_k^-1 J_k) and r' C_k^-1 r of one kind, r its errors after the fit.
+
+    Args:
+        joint: products of the unknowns' rows and, last, of the errors, of all kinds; S is its part
+            without the errors.
+        own: those of this kind.
+    """
+    right = np.concatenate([own[:, :-1, :-1], joint[:, :-1, -1:]], axis=2)
+    solved = np.linalg.solve(joint[:, :-1, :-1], right)
+    with_error = np.concatenate([-solved[..., -1], np.ones((len(own), 1))], axis=1)
+    squares = np.einsum("gp,gpq,gq->g", with_error, own, with_error)
+    return np.trace(solved[..., :-1], axis1=1, axis2=2), squares
+
+
+def _restricted_cost(joint: Float[np.ndarray, "g q q"]) -> Float[np.ndarray, " g"]:
+    """The sum of ln det S and the squares after the fit, ``joint`` as above."""
+    information, gradient = joint[:, :-1, :-1], joint[:, :-1, -1]
+    step = np.linalg.solve(information, gradient[..., None])[..., 0]
+    squares = joint[:, -1, -1] - np.sum(gradient * step, axis=1)
+    return np.linalg.slogdet(information)[1] + squares
 
 
 def _stretched(

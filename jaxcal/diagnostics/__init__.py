@@ -7,7 +7,7 @@
     tracker_distortion   one of these: tracked positions that are off, smoothly in space
     second_target    another one: images of two targets
     outlier_agreement   whether the images left out agree on another calibration
-    summary          all of these for a calibration or a batch
+    diagnose         all of these for a calibration or a batch
     directions, misfits, outliers, offset_fit   the same in words
     warnings         everything that a person should know before using an answer
     intervals        confidence intervals and target registration error

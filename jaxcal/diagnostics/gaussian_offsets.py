@@ -19,7 +19,7 @@ from jaxcal.model.image_points import mean_of_squares
 from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Float
-from jaxcal.runtime.arrays import map_arrays
+from jaxcal.runtime.arrays import batch_of_one
 from jaxcal.solvers.plan import TUNED
 
 Array = np.ndarray
@@ -81,7 +81,7 @@ def away_from_gaussian(
     limited = answer.prior in ("bounded", "uniform") and answer.data == "points"
     if answer.problem is None or not limited or images < MINIMUM_SELF_TUNING:
         return None
-    fit = GaussianOffsets.of(map_arrays(lambda leaf: np.asarray(leaf)[None], answer))
+    fit = GaussianOffsets.of(batch_of_one(answer))
     # Every kind gives a third of the unknowns' degrees of freedom.
     variance = fit.variance / (1 - fit.rows.shape[-1] / (3 * images))
     information = np.einsum("mkp,mkq->pq", fit.rows / variance[:, None], fit.rows)

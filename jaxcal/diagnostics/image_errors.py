@@ -35,7 +35,7 @@ from jaxcal.model.unknowns import (
 )
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import AnyArray, Float
-from jaxcal.runtime.arrays import array_module, map_arrays
+from jaxcal.runtime.arrays import array_module, batch_of_one
 from jaxcal.solvers.closed_form.single import ClosedForm
 from jaxcal.solvers.plan import TUNED
 
@@ -137,8 +137,7 @@ class ImageErrors:
     @classmethod
     def of_closed_form(cls, found: ClosedForm, problem: Problem, blocks: Blocks) -> ImageErrors:
         """The errors of a closed form of one problem, with a leading axis of length 1."""
-        alone = map_arrays(lambda leaf: np.asarray(leaf, float)[None], problem)
-        return cls.of(Unknowns.of_closed_form(found, problem), alone, blocks)
+        return cls.of(Unknowns.of_closed_form(found, problem), batch_of_one(problem), blocks)
 
     @classmethod
     def of(

@@ -33,7 +33,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -42,7 +41,7 @@ from jaxcal.diagnostics.uncertainty import inverses, variances_by_axis
 from jaxcal.model.unknowns import predicted_distance
 from jaxcal.result.calibration import Calibration, check_one, data_of
 from jaxcal.runtime.array_types import Bool, Float, Int
-from jaxcal.runtime.arrays import map_arrays
+from jaxcal.runtime.arrays import batch_of_one
 from jaxcal.solvers.plan import TUNED
 
 Array = np.ndarray
@@ -118,19 +117,13 @@ def influence_of(calibration: Calibration) -> Influence:
     """
     data_of(calibration)
     check_one(calibration.status_code)
-    alone = map_arrays(_first, calibration.numpy())
+    alone = batch_of_one(calibration.numpy())
     with np.errstate(all="ignore"):
         found = whitened_errors(alone)
         averaged = calibration.offset_law is not None and bool(calibration.offset_law.weighed)
         at_minimum = not averaged and calibration.method != "alternating"
         precision, away = further_prior(alone)
         return _influence(found, precision, away, at_minimum=at_minimum)
-
-
-def _first(leaf: Any) -> Array:
-    """The array in float64 with a leading axis of length 1, as a batch of one."""
-    values = np.asarray(leaf)
-    return (values.astype(float) if values.dtype.kind == "f" else values)[None]
 
 
 def _influence(

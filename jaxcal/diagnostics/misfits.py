@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxcal.diagnostics.residual_checks import FEWEST_TO_CHECK
 from jaxcal.result.calibration import Calibration
-from jaxcal.result.findings import MISFITS
+from jaxcal.result.diagnostics import MISFITS
 from jaxcal.runtime.array_types import AnyArray
 from jaxcal.runtime.arrays import finite_or_none
 

@@ -67,9 +67,7 @@ def agreeing_outliers(
         own, problem, kept
     ):
         return None
-    stretch = pixel_size(other, problem) / pixel_size(own, problem)
-    face = float(np.asarray(problem.face_offset))
-    apart = distance(own.image_to_probe, other.image_to_probe, stretch, grid, face)
+    apart = apart_in_image(own, other, problem, grid)
     if apart <= LEAST_APART * stated * math.sqrt(1 + kept.sum() / left.sum()):
         return None
     return int(left.sum()), apart
@@ -82,7 +80,26 @@ def _sd_in_image(found: ClosedForm, problem: Problem, used: np.ndarray) -> float
     return math.sqrt(float(np.sum(off**2)) / freedom)
 
 
-def pixel_size(found: ClosedForm | Calibration, problem: Problem) -> Float[np.ndarray, " 2"]:
+def apart_in_image(
+    first: ClosedForm | Calibration,
+    second: ClosedForm | Calibration,
+    problem: Problem,
+    grid: Float[np.ndarray, "m 2"],
+) -> float:
+    """How far apart two calibrations put the same pixels on the probe, root mean square, mm.
+
+    Args:
+        first: of one problem, with concrete values.
+        second: of the same problem.
+        problem: for the given size of a pixel, and the range of pixel row 0.
+        grid: points of the image by the first one, [lateral, axial], mm.
+    """
+    stretch = _pixel_size(second, problem) / _pixel_size(first, problem)
+    x, other = np.asarray(first.image_to_probe), np.asarray(second.image_to_probe)
+    return distance(x, other, stretch, grid, float(np.asarray(problem.face_offset)))
+
+
+def _pixel_size(found: ClosedForm | Calibration, problem: Problem) -> Float[np.ndarray, " 2"]:
     """Lateral and axial size of a pixel, mm; ones for points in mm."""
     spacing = np.asarray(problem.spacing, float)
     return spacing if found.scale_mm_per_px is None else np.asarray(found.scale_mm_per_px)

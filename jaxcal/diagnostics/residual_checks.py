@@ -39,7 +39,7 @@ from jaxcal.model.outlying import robust_sd, stands_out, studentise
 from jaxcal.model.thresholds import FEWEST_IMAGES
 from jaxcal.model.unknowns import block_slice, further_derivatives, measured
 from jaxcal.result.calibration import Calibration
-from jaxcal.result.findings import Inspection
+from jaxcal.result.diagnostics import Inspection
 from jaxcal.runtime.array_types import AnyArray, Float
 from jaxcal.solvers.plan import TUNED
 

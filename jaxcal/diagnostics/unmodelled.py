@@ -45,7 +45,7 @@ from jaxcal.diagnostics.second_target import FEWEST as FEWEST_OF_TWO
 from jaxcal.diagnostics.second_target import second_target
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Bool, Float
-from jaxcal.runtime.arrays import map_arrays
+from jaxcal.runtime.arrays import batch_of_one
 from jaxcal.solvers.plan import TUNED
 
 Array = np.ndarray
@@ -55,8 +55,8 @@ FEWEST = 12
 _FEWEST_CONVENTIONAL = 15
 """The same for conventional fits: of 300 clean ones of 12 images, 9 would be reported."""
 
-_FREEDOM = {"scale": 2, "slip": 3, "step": 3, "skew": 1, "curve": 1, "beside": 1}
-"""Number of parameters of each error."""
+_OF_POINTS = ("scale", "skew", "curve")
+"""Errors of the measured points (:func:`_excess`); the others are of the poses or the target."""
 _BY_CHANCE = {
     "scale": 13.8,
     "slip": 16.3,
@@ -116,13 +116,9 @@ class Unmodelled:
             face_mm: range of pixel row 0.
         """
         by = jacobian @ self.step
-        if self.kind == "scale":
-            by[:, 0] -= self.values[0] * points[:, 0]
-            by[:, 2] -= self.values[1] * (points[:, 1] - face_mm)
-        if self.kind == "skew":
-            by[:, 0] -= self.values[0] * points[:, 1]
-        if self.kind == "curve":
-            by[:, 2] -= self.values[0] * (points[:, 0] / SIDE_MM) ** 2
+        if self.kind in _OF_POINTS:
+            lateral, axial = points.T
+            by -= (_excess(self.kind, lateral, axial, face_mm) @ self.values)[:, [0, 2, 1]]
         if self.kind == "beside":
             by[:, 1] += self.values[0]
         slip = np.zeros_like(by)
@@ -144,32 +140,30 @@ def unmodelled(calibration: Calibration) -> list[Unmodelled]:
     points = calibration.data == "points"
     if calibration.problem is None or not points or used.sum() < fewest:
         return []
-    answer = map_arrays(lambda leaf: np.asarray(leaf)[None], calibration.numpy())
+    answer = batch_of_one(calibration.numpy())
     if calibration.prior in TUNED:
         seen = ImageErrors.of_answer(answer).centred(answer)
     else:
         # Offsets that are free within a bound absorb much of an error, above all a step; and
         # the conventional fit, which has none, weighs them like the other errors.
         seen = GaussianOffsets.of(answer).seen
+    images, known = int(used.sum()), seen.rows.shape[-1]
     columns = _columns(seen, used)
-    rows = np.concatenate([seen.rows[0], *(each for _, _, each in columns)], axis=-1)[None]
-    found: list[Unmodelled] = []
-    unknowns = at = seen.rows.shape[-1]
     with np.errstate(all="ignore"):
-        whitened = in_sds(answer, replace(seen, rows=rows))
-        errors, rows = shortened(whitened.errors[0][used], whitened.rows[0][used])
-        before, _ = tuned(errors, rows[..., :unknowns], int(used.sum()))
-        parts = []
-        for kind, image, _ in columns:
-            parts.append((kind, image, rows[..., np.r_[:unknowns, at : at + _FREEDOM[kind]]]))
-            at += _FREEDOM[kind]
-        steps = [each for each in parts if each[0] == "step"]
+        errors, rows = shortened(*_in_sds(answer, seen, used, [each for _, _, each in columns]))
+        before, _ = tuned(errors, rows[..., :known], images)
+        tried, at = [], known
+        for kind, image, own in columns:
+            after = at + own.shape[-1]
+            tried.append((kind, image, rows[..., np.r_[:known, at:after]]))
+            at = after
+        steps = [each for each in tried if each[0] == "step"]
         gains = _gains(errors, np.stack([part for _, _, part in steps]), before)
-        parts = [each for each in parts if each[0] != "step"] + [steps[int(np.argmax(gains))]]
-        for kind, image, part in parts:
-            each = _fit(kind, errors, part, before, int(used.sum()))
-            if each is not None:
-                found.append(replace(each, image=image))
+        tried = [each for each in tried if each[0] != "step"] + [steps[int(np.argmax(gains))]]
+        fits = [
+            (image, _fit(kind, errors, part, known, before, images)) for kind, image, part in tried
+        ]
+        found = [replace(each, image=image) for image, each in fits if each is not None]
         found += _distortion(answer, seen, used)
         found.sort(key=lambda each: -each.statistic / _BY_CHANCE[each.kind])
         two = _two_targets(answer, seen, used)
@@ -187,29 +181,60 @@ def _columns(
 
     With each kind, and the first image after a step.
     """
-    lateral, distance = seen.lateral[0], seen.distance[0]
+    distance = seen.distance[0]
     face = float(np.asarray(seen.problem.face_offset)[0])
-    zero = np.zeros_like(lateral)
+    zero = np.zeros_like(distance)
     order = (np.cumsum(used) - 1) / (used.sum() - 1) - 0.5
     within = seen.rows[0][..., _WITHIN] * [[1.0], [1.0], [0.0]]
     found: list[tuple[str, int | None, Array]] = [
         ("slip", None, order[:, None, None] * within),
-        ("skew", None, np.stack([-distance, zero, zero], axis=-1)[..., None]),
-        ("curve", None, np.stack([zero, -((lateral / SIDE_MM) ** 2), zero], axis=-1)[..., None]),
         ("beside", None, np.stack([zero, 0.5 / distance, zero], axis=-1)[..., None]),
     ]
-    if not {"scale", "sound-speed"} & set(seen.blocks):
-        along = (
-            np.stack([-lateral, zero, zero], axis=-1),
-            np.stack([zero, face - distance, zero], -1),
-        )
-        found.append(("scale", None, np.stack(along, axis=-1)))
+    for kind in _OF_POINTS:
+        if kind != "scale" or not {"scale", "sound-speed"} & set(seen.blocks):
+            # A measurement without its excess is smaller; the prediction less it is larger.
+            found.append((kind, None, _excess(kind, seen.lateral[0], distance, face)))
     images = np.flatnonzero(used)
     places = np.linspace(_BESIDE_STEP, len(images) - _BESIDE_STEP, _MOST_STEPS)
     for image in images[np.unique(np.round(places).astype(int))]:
         after = np.where(np.arange(len(used)) < image, -0.5, 0.5)
         found.append(("step", int(image), after[:, None, None] * within))
     return [(kind, image, np.where(used[:, None, None], each, 0.0)) for kind, image, each in found]
+
+
+def _excess(
+    kind: str, lateral: Float[Array, " n"], distance: Float[Array, " n"], face_mm: float
+) -> Float[Array, "n 3 k"]:
+    """By how much an error makes points too large: lateral position, range, offset (0), mm.
+
+    Args:
+        kind: one of :data:`_OF_POINTS`; the last axis has its parameters, of which each is 1.
+        lateral: mm.
+        distance: range, mm.
+        face_mm: range of pixel row 0.
+    """
+    zero = np.zeros_like(lateral)
+    along = {
+        "scale": [(lateral, zero, zero), (zero, distance - face_mm, zero)],
+        "skew": [(distance, zero, zero)],
+        "curve": [(zero, (lateral / SIDE_MM) ** 2, zero)],
+    }
+    return np.stack([np.stack(each, axis=-1) for each in along[kind]], axis=-1)
+
+
+def _in_sds(
+    answer: Calibration,
+    seen: ImageErrors,
+    used: Bool[Array, " n"],
+    columns: list[Float[Array, "n 3 _"]],
+) -> tuple[Float[Array, "m 3"], Float[Array, "m 3 q"]]:
+    """Errors of the images in use, and their derivatives by the unknowns and by ``columns``.
+
+    In SDs where the answer has them, else in mm; ``columns`` are of one recording's errors in mm.
+    """
+    rows = np.concatenate([seen.rows[0], *columns], axis=-1)[None]
+    whitened = in_sds(answer, replace(seen, rows=rows))
+    return whitened.errors[0][used], whitened.rows[0][used]
 
 
 def _gains(
@@ -227,29 +252,27 @@ def _fit(
     kind: str,
     errors: Float[Array, "m 3"],
     rows: Float[Array, "m 3 q"],
+    known: int,
     before: Float[Array, " 3"],
     images: int,
 ) -> Unmodelled | None:
-    """The further parameters, the last of the columns, if the residuals of the images show them.
+    """The parameters of the columns after the ``known`` unknowns, if the residuals show them.
 
     ``before`` are the mean squared errors of each kind without them.
     """
-    unknowns = rows.shape[-1] - _FREEDOM[kind]
     after, step = tuned(errors, rows, images)
     # Every kind gives a third of the unknowns' degrees of freedom, and its part of theta's.
-    touched = np.any(rows[..., unknowns:] != 0, axis=(0, 2))
-    freedom = images - unknowns / 3 - touched * (_FREEDOM[kind] / touched.sum())
+    touched = np.any(rows[..., known:] != 0, axis=(0, 2))
+    further = rows.shape[-1] - known
+    freedom = images - known / 3 - touched * (further / touched.sum())
     statistic = float(np.sum(freedom * np.log(before / after)))
     if not statistic > _BY_CHANCE[kind]:
         return None
-    values, step = step[unknowns:], step[:unknowns]
+    values, step = step[known:], step[:known]
     if kind == "beside":
         if not values[0] > 0:
             return None
         values = np.sqrt(values)
-    if kind in ("scale", "skew", "curve"):
-        # What has to be added is what is missing.
-        values = -values
     return Unmodelled(kind, values, statistic, step)
 
 
@@ -259,9 +282,7 @@ def _two_targets(
     """A second target, if the residuals of the images show it."""
     if used.sum() < FEWEST_OF_TWO:
         return None
-    rows = np.concatenate([seen.rows[0], tracker_distortion.by_target(seen)], axis=-1)[None]
-    whitened = in_sds(answer, replace(seen, rows=rows))
-    errors, rows = whitened.errors[0][used], whitened.rows[0][used]
+    errors, rows = _in_sds(answer, seen, used, [tracker_distortion.by_target(seen)])
     before, _ = tuned(*shortened(errors, rows[..., :-3]), len(errors))
     found = second_target(errors, rows, before)
     if found is None:
@@ -276,11 +297,8 @@ def _distortion(
 ) -> list[Unmodelled]:
     """A distortion of the tracked positions, if the residuals of the images show it."""
     positions = np.asarray(seen.problem.poses)[0, :, :3, 3]
-    columns = tracker_distortion.columns(seen, used)
-    rows = np.concatenate([seen.rows[0], columns], axis=-1)[None]
-    whitened = in_sds(answer, replace(seen, rows=rows))
+    errors, rows = _in_sds(answer, seen, used, [tracker_distortion.columns(seen, used)])
     start = float(np.mean(seen.errors[0][used][:, :2] ** 2))
-    errors, rows = whitened.errors[0][used], whitened.rows[0][used]
     found = tracker_distortion.fit(errors, rows, start)
     if found is None or not found.statistic > _BY_CHANCE["distortion"]:
         return []

@@ -27,9 +27,9 @@ from jaxcal.diagnostics.gaussian_offsets import away_from_gaussian
 from jaxcal.diagnostics.image_errors import KINDS, ImageErrors, noise_covariance
 from jaxcal.diagnostics.influence import Influence, conventional_fit, excess, in_image, influence_of
 from jaxcal.diagnostics.intervals import image_jacobian, predicted_tre, tre_at, tre_over
-from jaxcal.diagnostics.outlier_agreement import agreeing_outliers, pixel_size
+from jaxcal.diagnostics.outlier_agreement import agreeing_outliers, apart_in_image
 from jaxcal.diagnostics.unmodelled import unmodelled
-from jaxcal.model.image_points import distance, mean_of_squares
+from jaxcal.model.image_points import mean_of_squares
 from jaxcal.report.contradictions import contradictions
 from jaxcal.result.calibration import Calibration
 from jaxcal.result.saved import ASKED_FOR
@@ -256,11 +256,6 @@ def _comparison(
     covariance, log_density = conventional_fit(seen, used, noise)
     error = float(np.sum(weight * covariance))
     gaussian = float(np.sum(weight * found.model_covariance))
-    # Compare where both calibrations put the image's pixels on the probe.
-    stretch = pixel_size(other, problem) / pixel_size(answer, problem)
-    face = float(np.asarray(problem.face_offset))
-    x = np.asarray(other.image_to_probe)
-    apart = distance(np.asarray(answer.image_to_probe), x, stretch, grid, face)
     density = found.log_density - log_density
     gain = spread = None
     # Within a bound, offsets fit themselves: their errors are zero, and have no density.
@@ -270,12 +265,12 @@ def _comparison(
     return {
         "conventional_rms_mm": float(other.rms_mm),
         "rms_mm": float(answer.rms),
-        "apart_mm": apart,
+        "apart_mm": apart_in_image(answer, other, problem, grid),
         "conventional_tre_mm": math.sqrt(error) if error > 0 else None,
         "tre_mm": math.sqrt(gaussian) if gaussian > 0 else None,
         "log_density_gain": gain,
         "log_density_gain_sd": spread,
-        "conventional_image_plane_to_probe": x,
+        "conventional_image_plane_to_probe": np.asarray(other.image_to_probe),
     }
 
 

@@ -24,7 +24,7 @@ from jaxcal.diagnostics.outliers import outliers, suspects
 from jaxcal.model.image_points import mean_of_squares
 from jaxcal.report.accuracy import error_shares, region_of, scatter_shares
 from jaxcal.report.convergence import Curve
-from jaxcal.report.summary import recording_of
+from jaxcal.report.in_memory import recording_of
 from jaxcal.report.svg import BLUE, GREEN, ORANGE, bar_length, drawn, spread_out
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Float

@@ -16,7 +16,8 @@ from jaxcal.report.resampled import resampled_sentences
 from jaxcal.result.saved import ASKED_FOR
 from jaxcal.solvers.plan import TUNED
 
-FEW_IMAGES = 20
+ENOUGH_IMAGES = 20
+"""With fewer images in use, more are advised even if the error to expect is small."""
 _MOST_MOVED_SHARE = 0.3
 """An image is named if leaving it out moves image points by more than this share of the stated
 error."""
@@ -346,7 +347,7 @@ def _out_of_plane(record: dict[str, Any]) -> bool:
 
 def advice(record: dict[str, Any]) -> list[str]:
     """What to do, as sentences."""
-    status, few = record["status"], record["images_used"] < FEW_IMAGES
+    status, few = record["status"], record["images_used"] < ENOUGH_IMAGES
     advice: list[str] = []
     if record.get("wrong_frames"):
         return advice

@@ -15,7 +15,7 @@ from jaxcal.data.probe import Probe
 from jaxcal.data.problem import Problem
 from jaxcal.model.distributions import OffsetLaw
 from jaxcal.model.unknowns import TABLE, Blocks, Values, block_slice, in_image, with_prior
-from jaxcal.result.findings import Inspection, Summary
+from jaxcal.result.diagnostics import Diagnostics, Inspection
 from jaxcal.result.saved import check_target, dated
 from jaxcal.result.transform import AppliedPoints, ImageTransform, SaveFormat
 from jaxcal.runtime.array_types import AnyArray, Bool, Float, Int
@@ -329,49 +329,46 @@ class Calibration:
         Raises:
             CalibrationError: under jit, vmap or grad, where there is no text: use ``status_code``.
         """
-        return status_names(self._concrete(self.status_code))
+        _refuse_traced(self.status_code)
+        return status_names(np.asarray(self.status_code))
 
     @cached_property
-    def _summary(self) -> Summary:
+    def _diagnostics(self) -> Diagnostics:
         """The diagnostics, computed when one of them is first read."""
-        from jaxcal.diagnostics.summary import summarise
+        from jaxcal.diagnostics.diagnose import diagnose
 
-        if is_traced(self):
-            raise CalibrationError(
-                "diagnostics are computed on the host and are not there under jit, vmap or grad: "
-                "read them outside; status_code, converged and covariance are there"
-            )
-        return summarise(self)
+        answer = self.numpy()
+        return diagnose(self) if answer is self else answer._diagnostics
 
     @property
     def elevation_sd(self) -> Float[np.ndarray, "*batch n"]:
         """SD of ``elevation``, mm; NaN where an offset rests on its bound or is not known."""
-        return self._summary.elevation_sd
+        return self._diagnostics.elevation_sd
 
     @property
     def residual(self) -> Float[np.ndarray, "*batch n 3"]:
         """q_i - p_i with p_i in the plane (y = 0), in the image frame, mm."""
-        return self._summary.residual
+        return self._diagnostics.residual
 
     @property
     def at_bound(self) -> Float[np.ndarray, "*batch n"]:
         """1 where the offset rests on its bound."""
-        return self._summary.at_bound
+        return self._diagnostics.at_bound
 
     @property
     def condition(self) -> Float[np.ndarray, "*batch"]:
         """Largest over smallest eigenvalue of all unknowns' information, in scaled units."""
-        return self._summary.condition
+        return self._diagnostics.condition
 
     @property
     def weakest(self) -> Float[np.ndarray, "*batch p"]:
         """Unit vector (scaled units) of the least well determined direction of all unknowns."""
-        return self._summary.weakest
+        return self._diagnostics.weakest
 
     @property
     def weakest_sd(self) -> Float[np.ndarray, "*batch"]:
         """SD along ``weakest``, mm at the lever arm; NaN where there is no finite SD."""
-        return self._summary.weakest_sd
+        return self._diagnostics.weakest_sd
 
     @property
     def prior_direction(self) -> Float[np.ndarray, "*batch p"]:
@@ -379,17 +376,17 @@ class Calibration:
 
         It is a unit vector in scaled units; zeros where there is no such direction.
         """
-        return self._summary.prior_direction
+        return self._diagnostics.prior_direction
 
     @property
     def inspection(self) -> Inspection:
         """Images that stand out, the noise model's fit, and which poses to add."""
-        return self._summary.inspection
+        return self._diagnostics.inspection
 
     @property
     def outlier(self) -> Float[np.ndarray, "*batch n"]:
         """1 where an image does not fit the rest; a robust solve leaves it out."""
-        return self._summary.inspection.outlier
+        return self._diagnostics.inspection.outlier
 
     @property
     def studentised_errors(self) -> Float[np.ndarray, "*batch n 3"]:
@@ -397,7 +394,7 @@ class Calibration:
 
         They are corrected for leverage.
         """
-        return self._summary.inspection.studentised_errors
+        return self._diagnostics.inspection.studentised_errors
 
     @cached_property
     def wrong_frames(self) -> str | None:
@@ -412,7 +409,9 @@ class Calibration:
         """
         from jaxcal.diagnostics.frame_checks import wrong_frames
 
-        check_one(self._concrete(self.status_code))
+        check_one(self.status_code)
+        if (answer := self.numpy()) is not self:
+            return answer.wrong_frames
         if self.problem is None:
             return None
         return wrong_frames(replace(self.problem, mask=self.mask), self.blocks)
@@ -429,7 +428,9 @@ class Calibration:
         """
         from jaxcal.diagnostics.frame_checks import doubtful_unit
 
-        check_one(self._concrete(self.status_code))
+        check_one(self.status_code)
+        if (answer := self.numpy()) is not self:
+            return answer.doubtful_unit
         if self.problem is None or self.wrong_frames is not None:
             return None
         return doubtful_unit(replace(self.problem, mask=self.mask))
@@ -455,8 +456,7 @@ class Calibration:
             IndexError: beyond the batch.
             InputError: for one calibration, so that a loop over it does not end silently.
         """
-        if self.mask.ndim == 1:
-            raise InputError("this is one calibration, not a batch of them: it has no parts")
+        self._check_batch()
         # Numpy raises an error for an index outside the batch; JAX would clip it.
         np.empty(self.mask.shape[:-1])[index]
 
@@ -465,6 +465,23 @@ class Calibration:
             return np.asarray(leaf[index]) if isinstance(leaf, np.ndarray) else leaf[index]
 
         return map_arrays(taken, self)
+
+    def __len__(self) -> int:
+        """Number of calibrations along the first axis of a batch.
+
+        Raises:
+            InputError: for one calibration.
+        """
+        self._check_batch()
+        return self.mask.shape[0]
+
+    def __bool__(self) -> bool:
+        """True, also for an empty batch, and for one calibration, which has no length."""
+        return True
+
+    def _check_batch(self) -> None:
+        if self.mask.ndim == 1:
+            raise InputError("this is one calibration, not a batch of them: it has no parts")
 
     def with_problem(self, problem: Problem) -> Calibration:
         """The same calibration with the data that were solved."""
@@ -521,7 +538,7 @@ class Calibration:
         Args:
             tre_points: further image points, in the images' unit, for which to give the error.
         """
-        from jaxcal.report.summary import record_of
+        from jaxcal.report.in_memory import record_of
 
         return record_of(self, tre_points)
 
@@ -559,8 +576,8 @@ class Calibration:
             InputError: the file exists and is no such page, or is not named .html.
             OutputError: it could not be written and is unchanged.
         """
+        from jaxcal.report.in_memory import recording_of
         from jaxcal.report.page import write_page
-        from jaxcal.report.summary import recording_of
 
         write_page(path, dated(self.record()), self, recording_of(self))
 
@@ -609,17 +626,17 @@ class Calibration:
         """Table and verdict; for a batch how many converged; without data or values, the repr."""
         if not self._is_complete():
             return repr(self)
-        from jaxcal.report import summary
+        from jaxcal.report import in_memory
 
         if np.ndim(self.mask) != 1:
-            return summary.batch_text(self)
-        return summary.text_of(self)
+            return in_memory.batch_text(self)
+        return in_memory.text_of(self)
 
     def _repr_html_(self) -> str | None:
         """HTML for notebooks; None, so that the text is shown, if there is nothing to draw."""
         if not self._is_complete() or np.ndim(self.mask) != 1:
             return None
-        from jaxcal.report.summary import html_of
+        from jaxcal.report.in_memory import html_of
 
         return html_of(self)
 
@@ -629,24 +646,38 @@ class Calibration:
         return complete and not is_traced(self)
 
     def numpy(self) -> Calibration:
-        """The same calibration with numpy arrays (concrete values).
+        """The same calibration with numpy arrays (concrete values); itself if it has no others.
+
+        It is the same object every time, so that diagnostics are computed once.
 
         Raises:
             CalibrationError: under a JAX transformation.
         """
-        found = map_arrays(self._concrete, self)
-        if "_summary" in vars(self):
-            vars(found)["_summary"] = self._summary
-        return found
+        _refuse_traced(self)
+        return self._in_numpy or self
 
-    @staticmethod
-    def _concrete(value: AnyArray) -> np.ndarray:
-        if is_traced(value):
-            raise CalibrationError(
-                "texts, and what is computed by numpy, are not available under jit, vmap or grad: "
-                "use the arrays (status_code, converged, ...) there, and the rest outside"
-            )
-        return np.asarray(value)
+    @cached_property
+    def _in_numpy(self) -> Calibration | None:
+        """The calibration with numpy arrays; None if it has no others."""
+        others: list[AnyArray] = []
+
+        def converted(leaf: AnyArray) -> np.ndarray:
+            values = np.asarray(leaf)
+            if values is not leaf:
+                others.append(leaf)
+            return values
+
+        found = map_arrays(converted, self)
+        return found if others else None
+
+
+def _refuse_traced(value: Any) -> None:
+    """Raise CalibrationError for what a JAX transformation traces."""
+    if is_traced(value):
+        raise CalibrationError(
+            "texts, and what is computed by numpy, are not available under jit, vmap or grad: use "
+            "the arrays (status_code, converged, ...) there, and the rest outside"
+        )
 
 
 def status_names(status_code: Int[np.ndarray, "*batch"]) -> str | np.ndarray:

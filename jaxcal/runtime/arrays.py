@@ -152,6 +152,20 @@ def map_arrays(function: Callable[[Any], Any], tree: T) -> T:
     return assembled(type(tree), changed)
 
 
+def batch_of_one(tree: T) -> T:
+    """The tree as a batch of one: numpy arrays with a leading axis; float64 if they are floating.
+
+    Args:
+        tree: as of :func:`map_arrays`, with concrete values.
+    """
+
+    def alone(leaf: Any) -> np.ndarray:
+        values = np.asarray(leaf)
+        return (values.astype(float) if values.dtype.kind == "f" else values)[None]
+
+    return map_arrays(alone, tree)
+
+
 def each_image(tree: Any, change: Callable[[Any, int], Any]) -> Any:
     """The tree with ``change`` applied to every array that has an axis of images."""
     changed: dict[str, Any] = {}

@@ -11,7 +11,7 @@ from jaxcal.diagnostics.image_errors import ImageErrors
 from jaxcal.diagnostics.residual_checks import inspect
 from jaxcal.diagnostics.uncertainty import assess
 from jaxcal.result.calibration import Calibration, data_of
-from jaxcal.result.findings import Summary
+from jaxcal.result.diagnostics import Diagnostics
 from jaxcal.runtime.arrays import map_arrays
 
 Array = np.ndarray
@@ -20,7 +20,7 @@ CHUNK = 128
 """Problems computed at a time, so that their derivatives fit in the processor's caches."""
 
 
-def summarise(calibration: Calibration) -> Summary:
+def diagnose(calibration: Calibration) -> Diagnostics:
     """Compute the diagnostics.
 
     Args:
@@ -48,13 +48,13 @@ def summarise(calibration: Calibration) -> Summary:
     return _joined(pieces, batch)
 
 
-def _piece(answer: Calibration, eps: float) -> Summary:
+def _piece(answer: Calibration, eps: float) -> Diagnostics:
     """Diagnostics of calibrations with one leading axis."""
     seen = ImageErrors.of_answer(answer)
     shifted = seen.shifted(answer)
     uncertainty = assess(answer, shifted, eps)
     residual, _ = seen.from_circle(np.zeros_like(seen.mask))
-    return Summary(
+    return Diagnostics(
         elevation_sd=uncertainty.elevation_sd,
         at_bound=uncertainty.at_bound,
         residual=np.where(answer.mask[..., None] > 0, residual, 0.0),

@@ -46,7 +46,7 @@ class Inspection:
 
 
 @dataclass(frozen=True)
-class Summary:
+class Diagnostics:
     """Diagnostics of a calibration, or of a batch with leading axes.
 
     :class:`jaxcal.Calibration` has them as properties of the same names, which say what they are.
