@@ -45,6 +45,7 @@ from jaxcal.report.next_poses import next_poses_sentences, pose_records
 from jaxcal.report.record import _precision, calibration_record
 from jaxcal.report.tables import calibration_table
 from jaxcal.report.verdict import headline, limits, verdict
+from jaxcal.result.calibration import Status
 from jaxcal.result.saved import load_calibration
 from jaxcal.result.transform import ImageTransform
 from jaxcal.runtime.arrays import batch_of_one
@@ -750,3 +751,6 @@ def test_a_plan_says_where_in_the_frame_the_target_is_to_be(recording, result, c
     assert "{:.0f}, {:.0f} ".format(*record["poses"][0]["target_px"]) in said
     assert "(px)" in said
     assert "target_px" not in pose_records(found)[0]
+    unobservable = np.array(Status.UNOBSERVABLE.value)
+    unknown = replace(result, status_code=unobservable, scale_mm_per_px=np.array([0.0, 0.1]))
+    assert "target_px" not in pose_records(found, unknown)[0]

@@ -61,6 +61,15 @@ def test_every_slip_is_named_or_refused_and_no_right_file_is(slips, form):
                 assert "\n" not in said
 
 
+def test_mirrored_rotations_are_not_taken_for_mirrored_translations(slips):
+    """Both fit as well once one of them is reversed: the words name both, and do not choose."""
+    right = slips.recorded(0, "mm")
+    poses, mirror = right.poses.copy(), np.diag([1.0, -1.0, 1.0])
+    poses[:, :3, :3] = mirror @ poses[:, :3, :3] @ mirror
+    said = wrong_frames(Problem.from_recording(make_images(poses, right.points)))
+    assert "wrong sign along y, or their rotations turn the wrong way about the other two" in said
+
+
 def test_residuals_that_no_beam_explains_are_named(slips):
     """Quaternions whose x and z are exchanged turn poses in a way that nobody looks for."""
     right = slips.recorded(0, "mm")

@@ -5,7 +5,7 @@
     residual_checks  images that stand out, the fit of the noise model, which poses to add
     unmodelled       errors that the model leaves out and that the residuals show
     tracker_distortion   one of these: tracked positions that are off, smoothly in space
-    second_target    another one: images of two targets
+    second_target    another one: images of two targets, or with two origins
     outlier_agreement   whether the images left out agree on another calibration
     diagnose         all of these for a calibration or a batch
     directions, misfits, outliers, offset_fit   the same in words

@@ -292,8 +292,11 @@ def _slips(data: ImageData) -> Iterator[tuple[str, dict[str, np.ndarray]]]:
     for axis, name in enumerate("xyz"):
         signs = np.where(np.arange(3) == axis, -1.0, 1.0)
         yield (
-            f"the poses' translations have the wrong sign along {name} (a left-handed frame, "
-            "only partly converted?): reverse it",
+            # Rotations mirrored in the same axis fit as well: reversed translations would then make
+            # the frame left-handed, which nothing shows any more.
+            f"the poses' translations have the wrong sign along {name}, or their rotations turn "
+            f"the wrong way about the other two axes (a left-handed frame, only partly converted?):"
+            " correct the one that is wrong",
             {"translations": shifts * signs},
         )
     for order, name in (

@@ -1,9 +1,10 @@
-"""Were two targets marked in turn, some images of one and some of the other?
+"""Were two targets marked in turn, or have some images another origin than the others?
 
-Then the target of image i is c + s_i t / 2 with s_i = 1 or -1. With e the errors, J their
-derivatives by the unknowns and K_i those of image i by the target, s and t are alternately fitted
-to e + J d + s K t / 2, from several directions of t. Elevational errors do not tell which target an
-image shows, as offsets may come in two groups as well.
+Then the target of image i is c + s_i t / 2 with s_i = 1 or -1, or its point is off by s_i t / 2
+within the image. With e the errors, J their derivatives by the unknowns and K_i those of image i by
+the target or by the point, s and t are alternately fitted to e + J d + s K t / 2, from several
+directions of t. Elevational errors do not tell the two groups apart, as offsets may come in two
+groups as well.
 
 The best of the 2^n ways to divide n images fits better by chance, too. 2 ln LR was at most 2.2 n
 for 20 to 150 simulated images of one target, whatever the offsets' distribution, and at most 1.9 n
@@ -32,40 +33,45 @@ _ROUNDS = 20
 """Most rounds of dividing and fitting."""
 _MOST_SEARCHED = 150
 """Of more images, so many, evenly spread, are divided first."""
-_DIRECTIONS = np.array([d for d in product((-1, 0, 1), repeat=3) if d > (0, 0, 0)], float)
+_DIRECTIONS = {
+    size: np.array([d for d in product((-1, 0, 1), repeat=size) if d > (0,) * size], float)
+    for size in (2, 3)
+}
 """Directions from which t is looked for: axes, and diagonals of faces and of the cube."""
 
 
-class SecondTarget(NamedTuple):
-    """Two targets that explain the errors.
+class TwoGroups(NamedTuple):
+    """Two groups of images that explain the errors.
 
     Attributes:
         statistic: 2 ln LR.
-        apart: from one target to the other, tracker's frame, mm.
-        other: which images show the target that fewer images show.
+        apart: from the target or the origin of most images to that of the others: in the tracker's
+            frame, or laterally and axially, mm.
+        other: which images are of the smaller group.
         step: of the unknowns.
     """
 
     statistic: float
-    apart: Float[Array, " 3"]
+    apart: Float[Array, " k"]
     other: Bool[Array, " n"]
     step: Float[Array, " p"]
 
 
-def second_target(
-    errors: Float[Array, "n 3"], rows: Float[Array, "n 3 q"], before: Float[Array, " 3"]
-) -> SecondTarget | None:
-    """Two targets, if the errors of n images show them.
+def two_groups(
+    errors: Float[Array, "n 3"], rows: Float[Array, "n 3 q"], size: int, before: Float[Array, " 3"]
+) -> TwoGroups | None:
+    """Two groups, if the errors of n images show them.
 
     Args:
         errors: in any unit of each kind.
-        rows: J and, as the last three columns, K; zero for elevational errors.
-        before: mean squared errors of each kind with one target.
+        rows: J and, as the last columns, K; zero for elevational errors.
+        size: number of components of t: 3 for two targets, 2 for two origins.
+        before: mean squared errors of each kind without groups.
     """
-    count, unknowns = len(errors), rows.shape[-1] - 3
+    count, unknowns = len(errors), rows.shape[-1] - size
     known, along = rows[..., :unknowns], 0.5 * rows[..., unknowns:]
     # Every kind gives a third of the unknowns' degrees of freedom; t takes those of two kinds.
-    freedom = count - unknowns / 3 - np.array([1.5, 1.5, 0.0])
+    freedom = count - unknowns / 3 - 0.5 * size * np.array([1.0, 1.0, 0.0])
 
     def fitted(side: Array, some: Array) -> tuple[Array, Array]:
         both = np.concatenate([known[some], side[:, None, None] * along[some]], axis=-1)
@@ -77,7 +83,7 @@ def second_target(
     after, step = fitted(side, some)
     statistic, side = 0.0, np.zeros(count)
     for _ in range(_ROUNDS):
-        base, half = errors + known @ step[:-3], along @ step[-3:]
+        base, half = errors + known @ step[:unknowns], along @ step[unknowns:]
         last, side = side, _nearer(base, half, 1 / np.sqrt(after))
         if (side == last).all():
             break
@@ -86,10 +92,11 @@ def second_target(
         if count > _MOST_SEARCHED and statistic < BY_CHANCE * count / 2:
             # Further rounds gain little, and take long.
             return None
-    other = side != np.sign(side.sum() or 1)
+    most = np.sign(side.sum() or 1)
+    other = side != most
     if statistic <= BY_CHANCE * count or other.sum() < _LEAST_SHARE * count:
         return None
-    return SecondTarget(statistic, step[-3:], other, step[:-3])
+    return TwoGroups(statistic, -most * step[unknowns:], other, step[:unknowns])
 
 
 def _nearer(
@@ -102,7 +109,7 @@ def _nearer(
 def _divided(
     errors: Float[Array, "n 3"],
     known: Float[Array, "n 3 p"],
-    along: Float[Array, "n 3 3"],
+    along: Float[Array, "n 3 k"],
     weight: Float[Array, " 3"],
 ) -> Float[Array, " n"]:
     """How images are best divided, of the divisions from all first directions; the SDs stay."""
@@ -110,14 +117,14 @@ def _divided(
     alone = (errors * weight).ravel()
     alone -= basis @ (basis.T @ alone)
     found = []
-    for direction in _DIRECTIONS:
+    for direction in _DIRECTIONS[along.shape[-1]]:
         base, half = alone.reshape(-1, 3) / weight, along @ direction
         side, squares = np.zeros(len(errors)), np.inf
         for _ in range(_ROUNDS):
             last, side = side, _nearer(base, half, weight)
             if (side == last).all():
                 break
-            moved = (side[:, None, None] * along * weight[:, None]).reshape(-1, 3)
+            moved = (side[:, None, None] * along * weight[:, None]).reshape(-1, along.shape[-1])
             moved -= basis @ (basis.T @ moved)
             t = -np.linalg.lstsq(moved, alone, rcond=None)[0]
             rest, half = alone + moved @ t, along @ t

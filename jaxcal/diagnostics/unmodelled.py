@@ -26,8 +26,9 @@ A seventh, a distortion of the tracked positions, has a random field instead of 
 (:mod:`jaxcal.diagnostics.tracker_distortion`). Its limit is from simulations with errors that grow
 with depth as well. Half of it must be exceeded without any neighbourhood, too: a few neighbours
 with an error in common imitate a distortion. An eighth, a second target
-(:mod:`jaxcal.diagnostics.second_target`), has a parameter for each image, which says which of the
-two it shows. It goes first if it is the clearest in spite of the n ln 2 that these choices cost.
+or a second origin of the images (:mod:`jaxcal.diagnostics.second_target`), has a parameter for each
+image, which says which of the two it has. It goes first if it is the clearest in spite of the
+n ln 2 that these choices cost.
 
 References: Wilks 1938; Andrews 1993 (a change at an unknown place).
 """
@@ -42,7 +43,7 @@ from jaxcal.diagnostics import tracker_distortion
 from jaxcal.diagnostics.gaussian_offsets import GaussianOffsets, in_sds, shortened, tuned
 from jaxcal.diagnostics.image_errors import ImageErrors
 from jaxcal.diagnostics.second_target import FEWEST as FEWEST_OF_TWO
-from jaxcal.diagnostics.second_target import second_target
+from jaxcal.diagnostics.second_target import two_groups
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Bool, Float
 from jaxcal.runtime.arrays import batch_of_one
@@ -84,18 +85,19 @@ class Unmodelled:
     """An error that the model leaves out, and that the residuals show.
 
     Attributes:
-        kind: ``scale``, ``slip``, ``step``, ``skew``, ``curve``, ``beside``, ``distortion`` or
-            ``targets``.
+        kind: ``scale``, ``slip``, ``step``, ``skew``, ``curve``, ``beside``, ``distortion``,
+            ``targets`` or ``origins``.
         values: its parameters: by which shares lateral positions and ranges are too long; motion of
             X from the first image to the last (lateral and axial, mm; about y, rad); by which share
             of the depth lateral positions are too large; by how many mm ranges are too long 20 mm
             to the side; the distance m in mm; the root mean square distortion in mm; the distance
-            between two targets in mm.
+            between two targets in mm; by how much the points of ``images`` are off laterally and
+            axially, mm.
         statistic: 2 ln LR.
         step: by how much the unknowns would change if it were corrected; of a distortion, by one SD
             of each of its coefficients.
         image: the first one after a step, or None.
-        images: those that show the second target.
+        images: those of the second target or the second origin.
     """
 
     kind: str
@@ -166,7 +168,7 @@ def unmodelled(calibration: Calibration) -> list[Unmodelled]:
         found = [replace(each, image=image) for image, each in fits if each is not None]
         found += _distortion(answer, seen, used)
         found.sort(key=lambda each: -each.statistic / _BY_CHANCE[each.kind])
-        two = _two_targets(answer, seen, used)
+        two = _two_groups(answer, seen, used)
     if two is None:
         return found
     after = two.statistic - 2 * np.log(2) * used.sum()
@@ -276,20 +278,24 @@ def _fit(
     return Unmodelled(kind, values, statistic, step)
 
 
-def _two_targets(
+def _two_groups(
     answer: Calibration, seen: ImageErrors, used: Bool[Array, " n"]
 ) -> Unmodelled | None:
-    """A second target, if the residuals of the images show it."""
+    """A second target or a second origin, the clearer one that the residuals of the images show."""
     if used.sum() < FEWEST_OF_TWO:
         return None
-    errors, rows = _in_sds(answer, seen, used, [tracker_distortion.by_target(seen)])
-    before, _ = tuned(*shortened(errors, rows[..., :-3]), len(errors))
-    found = second_target(errors, rows, before)
-    if found is None:
-        return None
-    apart = np.array([np.linalg.norm(found.apart)])
-    images = tuple(np.flatnonzero(used)[found.other].tolist())
-    return Unmodelled("targets", apart, found.statistic, found.step, images=images)
+    within = np.broadcast_to(np.eye(3, 2), (len(used), 3, 2))
+    found: list[Unmodelled] = []
+    for kind, columns in (("targets", tracker_distortion.by_target(seen)), ("origins", within)):
+        errors, rows = _in_sds(answer, seen, used, [columns])
+        size = columns.shape[-1]
+        before, _ = tuned(*shortened(errors, rows[..., :-size]), len(errors))
+        two = two_groups(errors, rows, size, before)
+        if two is not None:
+            apart = np.array([np.linalg.norm(two.apart)]) if kind == "targets" else two.apart
+            images = tuple(np.flatnonzero(used)[two.other].tolist())
+            found.append(Unmodelled(kind, apart, two.statistic, two.step, images=images))
+    return max(found, key=lambda each: each.statistic, default=None)
 
 
 def _distortion(

@@ -39,7 +39,7 @@ SCATTER_TIMES = 1.3
 """Resampled calibrations may scatter by up to so many times the stated error."""
 
 MOST_IMAGES = 20
-"""So many images of a second target are named; the JSON has all."""
+"""So many images of a second target or origin are named; the JSON has all."""
 
 _WAYS = {"lateral": "sideways", "range": "in depth"}
 """Errors within the image, in the order of the residuals, and in words."""
@@ -151,10 +151,10 @@ def _from_unmodelled(record: dict[str, Any]) -> list[tuple[float, str]]:
         )
     else:
         lengths = "check pixel size, sound speed and the tracker's unit, or estimate the scale"
-    if found["kind"] == "targets":
+    if found["kind"] in ("targets", "origins"):
         # To first order the answer moves by less than it is wrong by, which in simulation was
         # of the order of the distance.
-        moved = max(moved, values[0])
+        moved = max(moved, math.hypot(*values))
     words = {
         "scale": lambda: (
             f"lateral positions that are too long by {100 * values[0]:.1f} % and ranges by "
@@ -193,6 +193,13 @@ def _from_unmodelled(record: dict[str, Any]) -> list[tuple[float, str]]:
             f"{', '.join(map(str, found['images'][:MOST_IMAGES]))}"
             f"{', ...' * (len(found['images']) > MOST_IMAGES)} (counted from 0) would explain the "
             "errors far better: were two targets, or two echoes of one, marked in turn?"
+        ),
+        "origins": lambda: (
+            f"points that are off by {values[0]:.1f} mm sideways and {values[1]:.1f} mm in depth "
+            f"in images {', '.join(map(str, found['images'][:MOST_IMAGES]))}"
+            f"{', ...' * (len(found['images']) > MOST_IMAGES)} (counted from 0) would explain the "
+            "errors far better: were these images cropped or zoomed in another way, or another "
+            "echo marked in them?"
         ),
     }
     return [(math.hypot(1.0, moved / stated), words[found["kind"]]())]

@@ -60,11 +60,13 @@ def next_poses_record(
 
 
 def pose_records(plan: design.Plan, result: Calibration | None = None) -> list[dict[str, Any]]:
-    """Each pose of a plan as plain values; targets in px, too, where ``result`` has pixels."""
+    """Each pose of a plan as plain values; targets in px, too, where ``result`` has their size."""
     model, bounds = plan.candidates.model, plan.candidates.constraints
     transform = None if result is None else result.image_transform()
     targets, pixels = plan.targets[:, [0, 2]], None
-    if transform is not None and transform.scale_mm_per_px is not None:
+    size = None if transform is None else transform.scale_mm_per_px
+    # Images that do not determine a pixel's size may make it zero.
+    if transform is not None and size is not None and (size > 0).all():
         pixels = transform._image_points(targets).tolist()
     return [
         {

@@ -382,6 +382,11 @@ def advice(record: dict[str, Any]) -> list[str]:
             "Import the points of one of the two targets alone, or calibrate with --robust, which "
             "leaves the images of the other one out if they are few."
         )
+    elif _unmodelled(record).get("kind") == "origins":
+        advice.append(
+            "Look at the images that are named, and correct their points or leave them out; "
+            "--robust leaves them out if they are few."
+        )
     elif not record.get("doubtful_unit") and (few or record["verdict"] == "uncertain"):
         advice.append(_addition(record))
     if status == "converged" and record["method"] == "conventional" and _out_of_plane(record):
