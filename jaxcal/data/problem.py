@@ -90,7 +90,8 @@ class Problem:
     Attributes:
         poses: probe -> tracker, mm.
         measurements: [lateral, range] in mm, or [u, v] in px when ``pixels``.
-        mask: 1 where the image is used, 0 where it is left out (its values are then ignored).
+        mask: 1 where the image is used, 0 where it is left out (its values are then ignored). No
+            derivative is taken by the mask: it is zero.
         spacing: [lateral, axial] mm per px (1 for points in mm); where pixels come without a known
             spacing it only sets the unit of the estimated scale.
         face_offset: range of pixel row 0, mm.
