@@ -431,12 +431,15 @@ def check_shapes(problem: Problem) -> None:
     """Refuse arrays that do not go together, as ``dataclasses.replace`` may leave a problem.
 
     Raises:
-        InputError: what is no array of real numbers, or has another shape than the mask asks for.
+        InputError: what is no array of real numbers, or has another shape than the mask asks for;
+            no images.
     """
     shape = tuple(np.shape(problem.mask))
     batch = shape[:-1]
     if not shape:
         raise InputError("mask of the problem must have an axis for the images")
+    if not shape[-1]:
+        raise InputError(f"the problem holds no images: at least {MINIMUM_IMAGES} are needed")
     channels = problem.channels
     if not isinstance(channels, Channels | None):
         raise InputError(f"channels of the problem must be Channels, not {shown(channels)}")
