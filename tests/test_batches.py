@@ -151,6 +151,12 @@ def test_stacking_unlike_problems_says_in_what_they_differ():
         jaxcal.stack([one, bare])
 
 
+def test_problems_without_images_are_refused():
+    none = select(drawn(1), slice(0))
+    with pytest.raises(jaxcal.InputError, match="no images"):
+        jaxcal.calibrate_batch(jaxcal.stack([none, none]), "conventional")
+
+
 def test_a_problem_of_fewer_images_has_its_own_answer():
     longer, shorter = (drawn(k, elevation_mm=1.5, noise_mm=1.0) for k in range(2))
     shorter = select(shorter, slice(8))

@@ -210,7 +210,8 @@ def test_derivatives_are_finite_differences(name):
             moved = replace(moved, channels=replace(start.channels, distances=measured))
         result = jaxcal.calibrate(moved, **others, **given)
         total = jnp.sum(weight * result.image_to_probe) + jnp.sum(result.point)
-        return total + jnp.sum(result.elevation[::2]), (result.differentiable, result.status_code)
+        total += jnp.sum(result.elevation[::2]) + result.cost
+        return total, (result.differentiable, result.status_code)
 
     @jax.jit
     def everything(data):
@@ -233,6 +234,44 @@ def test_derivatives_are_finite_differences(name):
         everything(jax.tree.map(lambda v, d, h=h: v + h * d, data, along))[0] for h in (step, -step)
     ]
     np.testing.assert_allclose(back, (ends[0] - ends[1]) / (2 * step), rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_second_derivatives_are_differences_of_the_first():
+    """By a whole problem, forward over reverse; an image that is left out has no derivative."""
+    start, rng = noisy(12), np.random.default_rng(0)
+    start = replace(
+        start,
+        mask=start.mask.at[3].set(0.0),
+        measurements=start.measurements.at[3].set(jnp.nan),
+    )
+    weight = jnp.asarray(rng.normal(size=(4, 4)))
+    along = replace(
+        jax.tree.map(jnp.zeros_like, start),
+        measurements=jnp.asarray(rng.normal(size=start.measurements.shape)),
+    )
+
+    def value(problem):
+        result = jaxcal.calibrate(problem, "conventional")
+        total = jnp.sum(weight * result.image_to_probe) + jnp.sum(result.point)
+        return total + jnp.sum(result.elevation[::2]) + jnp.sum(result.sigma)
+
+    @jax.jit
+    def both(problem):
+        return jax.jvp(jax.grad(value), (problem,), (along,))
+
+    first, second = both(start)
+    step = 1e-4
+    ends = [
+        both(replace(start, measurements=start.measurements + h * along.measurements))[0]
+        for h in (step, -step)
+    ]
+    for field in ("measurements", "poses"):
+        found = getattr(second, field)
+        difference = (getattr(ends[0], field) - getattr(ends[1], field)) / (2 * step)
+        np.testing.assert_allclose(found, difference, atol=1e-5 * np.abs(found).max())
+        assert not np.any(getattr(first, field)[3])
+    assert not np.any(first.mask)
 
 
 @pytest.mark.slow

@@ -67,7 +67,10 @@ def solve_problems(
         problems = replace(problems, mask=agreed)
     # Where a mask holds anything but 0 and 1, or an image has no covariance or bound that could be
     # one, the problem fails.
-    problems = replace(problems, mask=jnp.where(sound, problems.mask, jnp.nan))
+    mask = jnp.where(sound, problems.mask, jnp.nan)
+    # A mask is 0 or 1, and has no derivative; that of an image left out would be one of the
+    # harmless values.
+    problems = replace(problems, mask=jax.lax.stop_gradient(mask))
     if not plan.one_by_one:
         return _solved(problems, given, plan, begun)
 

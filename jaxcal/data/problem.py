@@ -90,7 +90,8 @@ class Problem:
     Attributes:
         poses: probe -> tracker, mm.
         measurements: [lateral, range] in mm, or [u, v] in px when ``pixels``.
-        mask: 1 where the image is used, 0 where it is left out (its values are then ignored).
+        mask: 1 where the image is used, 0 where it is left out (its values are then ignored). No
+            derivative is taken by the mask: it is zero.
         spacing: [lateral, axial] mm per px (1 for points in mm); where pixels come without a known
             spacing it only sets the unit of the estimated scale.
         face_offset: range of pixel row 0, mm.
@@ -442,12 +443,15 @@ def check_shapes(problem: Problem) -> None:
     """Refuse arrays that do not go together, as ``dataclasses.replace`` may leave a problem.
 
     Raises:
-        InputError: what is no array of real numbers, or has another shape than the mask asks for.
+        InputError: what is no array of real numbers, or has another shape than the mask asks for;
+            no images.
     """
     shape = tuple(np.shape(problem.mask))
     batch = shape[:-1]
     if not shape:
         raise InputError("mask of the problem must have an axis for the images")
+    if not shape[-1]:
+        raise InputError(f"the problem holds no images: at least {MINIMUM_IMAGES} are needed")
     channels = problem.channels
     if not isinstance(channels, Channels | None):
         raise InputError(f"channels of the problem must be Channels, not {shown(channels)}")

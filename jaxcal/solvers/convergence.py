@@ -8,7 +8,7 @@ from jaxcal.runtime.arrays import array_tree
 
 @array_tree
 class Convergence:
-    """How the method ended.
+    """How the method ended. Of these numbers the cost alone has a derivative.
 
     Attributes:
         cost: the minimised sum of squares, mm^2 (equal weights) or whitened.

@@ -7,11 +7,12 @@ curvature, the second the derivative of its gradient. The pass eliminates the of
 an offset at its bound moves with the bound. For the self-tuned solve F also includes the conditions
 of the SDs (:func:`jaxcal.solvers.reml.update_at`).
 
-Both functions return a step of the unknowns whose value is zero and whose tangent is how the
-solution moves with the data. They are ``jax.custom_jvp`` functions whose rules call the functions
-themselves, so they work in forward and reverse mode, to any order, under vmap and jit. They are
-valid where the solution is an isolated minimum with a fixed active set;
-``Calibration.differentiable`` says whether that is so.
+:func:`implicit_tangent` and :func:`self_tuned_tangent` return a step of the unknowns whose value is
+zero and whose tangent is how the solution moves with the data; :func:`minimum` returns the cost
+with its tangent. They are ``jax.custom_jvp`` functions whose rules call the functions themselves,
+at the solution as it moves with the data, so they work in forward and reverse mode, to any order,
+under vmap and jit. They are valid where the solution is an isolated minimum with a fixed active
+set; ``Calibration.differentiable`` says whether that is so.
 """
 
 from __future__ import annotations
@@ -57,17 +58,25 @@ def implicit_tangent(
 @in_standard_promotion
 def _implicit_jvp(primals: tuple, tangents: tuple) -> tuple:
     iterate, observation, images, medium = primals
+    step = implicit_tangent(*primals)
+    # Higher derivatives need all this where the solution is, which moves with the data as well.
+    here = iterate.moved(step)
 
     def gradient(
         observation: Observation, images: ImagePlanes, medium: MediumPrior | None
     ) -> Array:
-        return accumulate(iterate, observation, images, None, medium).gradient
+        return accumulate(here, observation, images, None, medium).gradient
 
     _, moved = jax.jvp(gradient, primals[1:], tangents[1:])
     exact = jnp.ones_like(images.mask[:, 0])
-    matrix = accumulate(iterate, observation, images, exact, medium).stacked()
+    matrix = accumulate(here, observation, images, exact, medium).stacked()
     inverse, _ = dense.inverse_batch_last(matrix)
-    return implicit_tangent(*primals), -dense.product_batch_last(inverse, moved)
+    onward = -dense.product_batch_last(inverse, moved)
+    # A step from there, as a change of the step from the iterate.
+    _, change = jax.jvp(
+        lambda further: iterate.step_to(here.moved(further)), (jnp.zeros_like(step),), (onward,)
+    )
+    return step, change
 
 
 @jax.custom_jvp
@@ -97,15 +106,17 @@ def self_tuned_tangent(
 @self_tuned_tangent.defjvp
 @in_standard_promotion
 def _self_tuned_jvp(primals: tuple, tangents: tuple) -> tuple:
-    iterate, sigma, *data = primals
+    iterate, _, *data = primals
     count = iterate.unknowns
+    # Higher derivatives need all this where the solution is, which moves with the data as well.
+    attached, sigma = self_tuned_tangent(*primals)
 
     def conditions(unknowns: Array, *data) -> Array:
         moved, log_sigma = iterate.moved(unknowns[:count]), unknowns[count:]
         normal, updated = reml.update_at(moved, jnp.exp(log_sigma), *data)
         return jnp.concatenate([normal.gradient, log_sigma - jnp.log(updated)])
 
-    here = jnp.concatenate([_no_step(iterate), jnp.log(sigma)])
+    here = jnp.concatenate([attached, jnp.log(sigma)])
 
     def along(direction: Array) -> Array:
         moving = jnp.broadcast_to(direction[:, None], here.shape)
@@ -118,7 +129,42 @@ def _self_tuned_jvp(primals: tuple, tangents: tuple) -> tuple:
     scale = 1 / jnp.max(jnp.abs(matrix), axis=1)
     inverse = jax.vmap(dense.inverse, in_axes=-1, out_axes=-1)(scale[:, None] * matrix)
     step = -dense.product_batch_last(inverse, scale * moved)
-    return self_tuned_tangent(*primals), (step[:count], sigma * step[count:])
+    return (attached, sigma), (step[:count], sigma * step[count:])
+
+
+@jax.custom_jvp
+def minimum(
+    cost: Float[Array, " batch"],
+    iterate: Iterate,
+    observation: Observation,
+    images: ImagePlanes,
+    medium: MediumPrior | None,
+) -> Float[Array, " batch"]:
+    """How the value of an objective at its minimiser moves with the data.
+
+    Args:
+        cost: the value that the solver found (not differentiated).
+        iterate: the minimiser as a function of the data.
+        observation: the objective, with its SDs as functions of the data.
+        images: the data.
+        medium: prior of further unknowns, or None.
+
+    Returns:
+        The cost.
+    """
+    del iterate, observation, images, medium
+    return cost
+
+
+@minimum.defjvp
+@in_standard_promotion
+def _minimum_jvp(primals: tuple, tangents: tuple) -> tuple:
+    def value(
+        iterate: Iterate, observation: Observation, images: ImagePlanes, medium: MediumPrior | None
+    ) -> Array:
+        return accumulate(iterate, observation, images, None, medium).cost
+
+    return minimum(*primals), jax.jvp(value, primals[1:], tangents[1:])[1]
 
 
 @jax.custom_jvp

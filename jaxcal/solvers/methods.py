@@ -220,7 +220,10 @@ def _attached(
         step = implicit.undefined_tangent(found.iterate, observation, images)
     else:
         step = implicit.implicit_tangent(found.iterate, observation, images, medium)
-    return replace(found, iterate=found.iterate.moved(step), observation=observation, medium=medium)
+    iterate = found.iterate.moved(step)
+    cost = implicit.minimum(found.convergence.cost, iterate, observation, images, medium)
+    convergence = replace(found.convergence, cost=cost)
+    return Solution(iterate, observation, medium, convergence)
 
 
 def _averaged(found: Solution, images: ImagePlanes, problems: Problem, plan: SolvePlan) -> Solution:
