@@ -238,7 +238,10 @@ claim(
 
 
 # Errors that the model leaves out.
-FAULTS = ("scale", "skew", "beside", "slip", "second echo", "curve", "step", "distortion")
+FAULTS = (
+    "scale", "skew", "beside", "slip", "second echo", "curve", "step", "distortion",
+    "targets",
+)  # fmt: skip
 
 
 def _left_out(of: str, *images: str) -> tuple[float, float]:
@@ -272,6 +275,16 @@ claim(
     "The distortion is named in {:.1f} % of the recordings with 12 images, {:.1f} % with 30 and "
     "{:.1f} % with 60.",
     lambda: percent(column("unmodelled", "right", fault="distortion")),
+)
+
+claim(
+    ACCURACY,
+    "Two targets are named in {:.1f} % of the recordings with 30 images that show them and in "
+    "{:.1f} % with 60, and in at most {:.1f} % of the clean ones.",
+    lambda: (
+        *percent(column("unmodelled", "right", fault="targets", images=("30", "60"))),
+        max(percent(column("unmodelled", "two_targets", fault="none"))),
+    ),
 )
 
 # Bounded and uniform offsets.
