@@ -155,6 +155,9 @@ def _from_unmodelled(record: dict[str, Any]) -> list[tuple[float, str]]:
         # To first order the answer moves by less than it is wrong by, which in simulation was
         # of the order of the distance.
         moved = max(moved, math.hypot(*values))
+    images = found["images"] or ()
+    more = ["..."] if len(images) > MOST_IMAGES else []
+    those = ", ".join([*map(str, images[:MOST_IMAGES]), *more])
     words = {
         "scale": lambda: (
             f"lateral positions that are too long by {100 * values[0]:.1f} % and ranges by "
@@ -189,17 +192,14 @@ def _from_unmodelled(record: dict[str, Any]) -> list[tuple[float, str]]:
             "errors that change slowly? Record again without it: more images hardly help"
         ),
         "targets": lambda: (
-            f"a second target, {values[0]:.1f} mm from the first one, in images "
-            f"{', '.join(map(str, found['images'][:MOST_IMAGES]))}"
-            f"{', ...' * (len(found['images']) > MOST_IMAGES)} (counted from 0) would explain the "
-            "errors far better: were two targets, or two echoes of one, marked in turn?"
+            f"a second target, {values[0]:.1f} mm from the first one, in images {those} (counted "
+            "from 0) would explain the errors far better: were two targets, or two echoes of one, "
+            "marked in turn?"
         ),
         "origins": lambda: (
             f"points that are off by {values[0]:.1f} mm sideways and {values[1]:.1f} mm in depth "
-            f"in images {', '.join(map(str, found['images'][:MOST_IMAGES]))}"
-            f"{', ...' * (len(found['images']) > MOST_IMAGES)} (counted from 0) would explain the "
-            "errors far better: were these images cropped or zoomed in another way, or another "
-            "echo marked in them?"
+            f"in images {those} (counted from 0) would explain the errors far better: were these "
+            "images cropped or zoomed in another way, or another echo marked in them?"
         ),
     }
     return [(math.hypot(1.0, moved / stated), words[found["kind"]]())]

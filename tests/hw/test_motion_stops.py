@@ -109,7 +109,7 @@ def test_interrupts_while_connecting_leave_no_program_on_the_robot(times):
                     except KeyboardInterrupt:
                         pass
 
-        while True:
+        for _ in range(5):
             given = confirm_unattended(plan, plan.digest, clock=robot.clock)
             motion = Motion(robot.host, plan, given, clock=robot.clock, dry_run=False)
             with as_interrupts(), suppress(KeyboardInterrupt):
@@ -120,6 +120,8 @@ def test_interrupts_while_connecting_leave_no_program_on_the_robot(times):
             motion.close()
             while robot.state()["running"]:
                 time.sleep(0.001)
+        else:
+            pytest.fail("motion was started five times in spite of an interrupt")
         assert motion._process is not None
         motion._process.wait(5.0)
         assert not robot.state()["running"]
