@@ -101,6 +101,11 @@ def finish(
     raise AssertionError("the bench cannot keep up with itself")
 
 
+def by_busy_machine(stopped: AcquisitionStopped, what: str) -> bool:
+    """Whether a delay of this machine stopped the run before the fault that ``what`` tells of."""
+    return stopped.by_itself and not re.search(what, str(stopped))
+
+
 def taken(path: Path) -> np.ndarray:
     with h5py.File(path) as file:
         return np.asarray(file["calibration/pose"])
@@ -178,7 +183,7 @@ def fault_in_the_middle(tmp_path, name: str, speed: float, rest_s: float | None)
             at.append(bench.fault(name, **arguments))
 
         def say(line: str) -> None:
-            if line.startswith("image 2/"):
+            if line.startswith(("image 2/", "image 3/", "image 4/")) and not at:
                 threading.Thread(target=strike, daemon=True).start()
 
         request: AcquisitionRequest | None = AcquisitionRequest(IMAGES, "none", 1, bench=3)
@@ -186,8 +191,10 @@ def fault_in_the_middle(tmp_path, name: str, speed: float, rest_s: float | None)
             with pytest.raises(AcquisitionStopped) as caught:
                 run(bench, path, request, say)
             request = None
-            if at:
+            if at and not by_busy_machine(caught.value, what):
                 break
+            at.clear()
+            bench.recover()
         line = str(caught.value)
         assert what in line
         assert "\n" not in line
@@ -386,7 +393,7 @@ def test_a_robot_that_may_not_move_is_named_and_the_run_is_resumed(e_series, tmp
         for _ in range(ATTEMPTS):
             with pytest.raises(AcquisitionStopped) as told:
                 run(bench, path, None, say, setup=setup)
-            if stopped:
+            if stopped and not by_busy_machine(told.value, text):
                 break
         assert text in str(told.value)
         assert not told.value.by_itself
@@ -490,8 +497,12 @@ def test_a_fault_of_any_device_stops_the_robot_and_the_run_is_resumed(e_series, 
             with pytest.raises(AcquisitionStopped) as caught:
                 run(bench, path, request, say, setup=setup, watch=watch)
             request = None
-            if struck.is_set():
+            if struck.is_set() and not by_busy_machine(caught.value, what):
                 break
+            if not path.exists():
+                request = AcquisitionRequest(4, "none", 1, bench=3)
+            struck.clear()
+            bench.recover()
         assert re.search(what, str(caught.value))
         assert "\n" not in str(caught.value)
         assert "--resume --bench" in str(caught.value)
