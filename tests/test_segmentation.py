@@ -452,6 +452,16 @@ def test_elements_in_another_order_are_named():
     assert not noisy.warnings
 
 
+@pytest.mark.parametrize(("factor", "told"), [(0.95, "negative"), (1.0, None), (1.05, "10 mm")])
+def test_a_curved_array_of_another_pitch_is_named(factor, told):
+    """Its offsets imitate the pitch; calibrations were 27 mm off, and said to be fair."""
+    _, distances = draw(C5_2, 30, 0.3)
+    probe = replace(C5_2, pitch_mm=factor * C5_2.pitch_mm)
+    words = [each for each in segment(raw(distances, C5_2), probe).warnings if "pitch" in each]
+    assert len(words) == (told is not None)
+    assert all(told in each for each in words)
+
+
 def test_a_pitch_in_another_unit_is_named():
     """It was "covariance 0 holds a number beyond 1e+07"."""
     _, distances = draw(L14_5, 12, 0.2)

@@ -58,6 +58,10 @@ _MANY = 0.1
 _FAR = 6.0
 # Receivers and waves have less noise; elements in another order or of another pitch give more.
 _NOISY_MM = 3.0
+# Squares of offsets, mm^2, are not negative (with room for delays of the elements),
+# nor larger than those of a beam 20 mm thick. With smaller offsets, noise takes half of the frames
+# beyond a limit at most; more by so many SDs of that number are a warning.
+_SQUARES, _SURE = (-25.0, 100.0), 4.0
 # A clock's ties are at most about as many at the longest time as at the next shorter one.
 _TIES = 4
 # Up to this many frames, compiling takes longer than the fit.
@@ -244,7 +248,10 @@ def segment(
         accepted=accepted & mask[:, None],
         noise_mm=np.where(mask, noise, np.nan),
         out_of_plane=out_of_plane,
-        warnings=_warnings(used, failed, missing, rejected, cut, noise[mask], probe.elements),
+        warnings=(
+            *_warnings(used, failed, missing, rejected, cut, noise[mask], probe.elements),
+            *_impossible_offsets(out_of_plane),
+        ),
     )
 
 
@@ -486,3 +493,26 @@ def _warnings(
         if lost > _MANY * total:
             found.append(f"{lost} of {total} lines ({100 * lost / total:.0f} %) {name}")
     return tuple(found)
+
+
+def _impossible_offsets(found: OutOfPlane | None) -> list[str]:
+    """A warning where the squares of the offsets show that the times are not those of this array.
+
+    An array of another pitch, radius or sound speed has distances that are more, or less, curved
+    along its elements, as offsets make them.
+    """
+    if found is None:
+        return []
+    square = found.position[np.isfinite(found.position[:, 2]), 2]
+    below, above = (square < _SQUARES[0]).sum(), (square > _SQUARES[1]).sum()
+    if max(below, above) <= 0.5 * (len(square) + _SURE * len(square) ** 0.5):
+        return []
+    what = (
+        "the squares of the target's distances from the image plane are negative"
+        if below > above
+        else f"the target is more than {_SQUARES[1] ** 0.5:.0f} mm beside the image plane"
+    )
+    return [
+        f"by the times of the elements, {what} in {max(below, above)} of {len(square)} frames: "
+        "check the array's pitch and radius, the sound speed and the delay"
+    ]
