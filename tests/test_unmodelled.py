@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -131,7 +132,19 @@ def two_echoes() -> Recording:
     return with_points(recording, points)
 
 
-# Images in use, and seeds: with the faults 127 problems, two chunks of 64.
+def far_from_the_plane() -> Recording:
+    """Targets 15 mm beside the plane, on both sides in turn."""
+    recording = clean(0)
+    images, truth = recording.calibration, recording.truth
+    points, poses = images.measurements.copy(), images.poses.copy()
+    offsets = targets_in_images(poses, truth.image_to_probe, truth.point)[:, 1]
+    far = np.where(np.arange(IMAGES) % 2, 15.0, -15.0)
+    poses[:, :3, 3] -= far[:, None] * (poses[:, :3, :3] @ truth.image_to_probe[:3, 1])
+    points[:, 1] = np.sqrt(points[:, 1] ** 2 - offsets**2 + (offsets + far) ** 2)
+    return replace(recording, calibration=make_images(poses, points))
+
+
+# Images in use, and seeds: with the faults 128 problems, two chunks of 64.
 CLEAN, SEEDS = (12, 30), range(100, 143)
 
 
@@ -140,6 +153,7 @@ def answers() -> dict[str, list[tuple[Recording, jaxcal.Calibration]]]:
     """All recordings that are not calibrated robustly, in one batch: one program."""
     sets = [(kind, IMAGES, map(fault, map(clean, range(4)))) for kind, fault in FAULTS.items()]
     sets.append(("echoes", IMAGES, [two_echoes()]))
+    sets.append(("far", IMAGES, [far_from_the_plane()]))
     sets.append(("neighbours", IMAGES, [neighbours(clean(seed), 2.0) for seed in range(100, 104)]))
     sets += [(f"clean {images}", images, map(clean, SEEDS)) for images in CLEAN]
     recordings, problems = {}, []
@@ -187,6 +201,31 @@ def test_what_the_model_leaves_out_is_found_and_lowers_the_verdict(answers, kind
         np.testing.assert_allclose(middle, [12.0], atol=0.5)
     if kind == "origins":
         np.testing.assert_allclose(middle, [3.0, -4.0], atol=0.5)
+
+
+def test_a_curved_array_at_another_sound_speed_is_named_where_that_is_estimated():
+    """Its image is stretched along its lines, so sideways as well; the model stretches ranges."""
+    recording, stretch = clean(0), 0.06
+    points = recording.calibration.measurements.copy()
+    stretched = points * np.array([1.0 + 0.6 * stretch, 1.0 + stretch])
+    for given, wrong in ((points * [1.0, 1.0 + stretch], False), (stretched, True)):
+        told = with_points(recording, given)
+        result = jaxcal.calibrate(told, "conventional", estimate=("sound-speed",))
+        found = unmodelled(result)
+        assert [each.kind for each in found[:1]] == ["lateral"] * wrong
+        if wrong:
+            np.testing.assert_allclose(found[0].values, [0.6 * stretch], atol=0.01)
+            words = "".join(calibration_record(result, told)["tre"]["contradictions"])
+            assert re.search(r"lateral positions that are too long by [34]\.. %", words)
+
+
+def test_residuals_larger_than_a_beam_is_thick_lower_the_verdict(answers):
+    """The model takes them for offsets, which may have any SD."""
+    ((recording, result),) = answers["far"]
+    record = calibration_record(result, recording)
+    assert record["rms_mm"] > 10 > 2 * record["tre"]["stated_mm"]
+    assert record["tre"]["rms_mm"] == pytest.approx(record["rms_mm"])
+    assert any("larger than a beam is thick" in words for words in record["tre"]["contradictions"])
 
 
 def neighbours(recording: Recording, error_mm: float) -> Recording:

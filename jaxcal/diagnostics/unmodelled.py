@@ -1,8 +1,10 @@
 """Would an error that the model leaves out explain the residuals better?
 
-Six are looked for with a few parameters theta, linearised at the answer:
+Seven are looked for with a few parameters theta, linearised at the answer:
 
     scale   the pixels' sizes or the sound speed: x and r are too long by a share of themselves
+    lateral the same of x alone, where the sound speed is estimated: a wrong width of the pixels, or
+            a curved array, in whose images a wrong sound speed stretches x as well
     slip    X moves within the image plane, steadily in the course of the recording (elevational
             offsets may drift for other reasons, and do not count)
     step    X moves so at once, between two images
@@ -22,10 +24,10 @@ places where the step may be. Its limit was found by simulation: Gaussian errors
 exceed 22 once in a thousand recordings, and errors that grow with depth 26 as often as they exceed
 the limit of a slip. An answer within bounds is first moved to the optimum of Gaussian offsets.
 
-A seventh, a distortion of the tracked positions, has a random field instead of few parameters
+An eighth, a distortion of the tracked positions, has a random field instead of few parameters
 (:mod:`jaxcal.diagnostics.tracker_distortion`). Its limit is from simulations with errors that grow
 with depth as well. Half of it must be exceeded without any neighbourhood, too: a few neighbours
-with an error in common imitate a distortion. An eighth, a second target
+with an error in common imitate a distortion. A ninth, a second target
 or a second origin of the images (:mod:`jaxcal.diagnostics.second_target`), has a parameter for each
 image, which says which of the two it has. It goes first if it is the clearest in spite of the
 n ln 2 that these choices cost.
@@ -56,10 +58,11 @@ FEWEST = 12
 _FEWEST_CONVENTIONAL = 15
 """The same for conventional fits: of 300 clean ones of 12 images, 9 would be reported."""
 
-_OF_POINTS = ("scale", "skew", "curve")
+_OF_POINTS = ("scale", "lateral", "skew", "curve")
 """Errors of the measured points (:func:`_excess`); the others are of the poses or the target."""
 _BY_CHANCE = {
     "scale": 13.8,
+    "lateral": 10.8,
     "slip": 16.3,
     "step": 26.0,
     "skew": 10.8,
@@ -85,14 +88,14 @@ class Unmodelled:
     """An error that the model leaves out, and that the residuals show.
 
     Attributes:
-        kind: ``scale``, ``slip``, ``step``, ``skew``, ``curve``, ``beside``, ``distortion``,
-            ``targets`` or ``origins``.
-        values: its parameters: by which shares lateral positions and ranges are too long; motion of
-            X from the first image to the last (lateral and axial, mm; about y, rad); by which share
-            of the depth lateral positions are too large; by how many mm ranges are too long 20 mm
-            to the side; the distance m in mm; the root mean square distortion in mm; the distance
-            between two targets in mm; by how much the points of ``images`` are off laterally and
-            axially, mm.
+        kind: ``scale``, ``lateral``, ``slip``, ``step``, ``skew``, ``curve``, ``beside``,
+            ``distortion``, ``targets`` or ``origins``.
+        values: its parameters: by which shares lateral positions and ranges are too long; by which
+            lateral positions alone; motion of X from the first image to the last (lateral and
+            axial, mm; about y, rad); by which share of the depth lateral positions are too large;
+            by how many mm ranges are too long 20 mm to the side; the distance m in mm; the root
+            mean square distortion in mm; the distance between two targets in mm; by how much the
+            points of ``images`` are off laterally and axially, mm.
         statistic: 2 ln LR.
         step: by how much the unknowns would change if it were corrected; of a distortion, by one SD
             of each of its coefficients.
@@ -192,8 +195,11 @@ def _columns(
         ("slip", None, order[:, None, None] * within),
         ("beside", None, np.stack([zero, 0.5 / distance, zero], axis=-1)[..., None]),
     ]
+    # An estimated sound speed is the scale of the ranges, so that only the other one can be wrong.
+    lengths = {"lateral"} if "sound-speed" in seen.blocks else {"scale"}
+    looked_for = {"skew", "curve"} | (set() if "scale" in seen.blocks else lengths)
     for kind in _OF_POINTS:
-        if kind != "scale" or not {"scale", "sound-speed"} & set(seen.blocks):
+        if kind in looked_for:
             # A measurement without its excess is smaller; the prediction less it is larger.
             found.append((kind, None, _excess(kind, seen.lateral[0], distance, face)))
     images = np.flatnonzero(used)
@@ -218,6 +224,7 @@ def _excess(
     zero = np.zeros_like(lateral)
     along = {
         "scale": [(lateral, zero, zero), (zero, distance - face_mm, zero)],
+        "lateral": [(lateral, zero, zero)],
         "skew": [(distance, zero, zero)],
         "curve": [(zero, (lateral / SIDE_MM) ** 2, zero)],
     }

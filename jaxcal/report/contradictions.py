@@ -2,6 +2,7 @@
 
 The covariance assumes that the noise model holds. It is contradicted if
 
+- the residuals are larger than a beam is thick (10 mm);
 - the residuals make the error larger than stated by more than three SDs of chance;
 - leaving one image out moves image points by more than half the stated error and by more than four
   times the expected move (by one step from the normal equations, or by cross-validation if this was
@@ -23,6 +24,7 @@ from typing import Any
 
 from jaxcal.diagnostics.misfits import DRIFT_SCORE, in_two_groups
 from jaxcal.diagnostics.unmodelled import SIDE_MM
+from jaxcal.diagnostics.warnings import IMPLAUSIBLE_RMS_MM
 
 CHANCE = 3.0
 """SDs of chance beyond which the residuals contradict the stated error."""
@@ -51,6 +53,11 @@ def _sd(record: dict[str, Any], kind: str) -> float | None:
     return None if size is None else math.hypot(size, record["tracker_sd_mm"] or 0.0)
 
 
+def _too_long(share: float) -> str:
+    """By how much a length is wrong."""
+    return f"too {'short' if share < 0 else 'long'} by {100 * abs(share):.1f} %"
+
+
 def contradictions(record: dict[str, Any]) -> list[tuple[float, str]]:
     """How many times as large as stated each contradiction makes the error, and its words.
 
@@ -58,6 +65,7 @@ def contradictions(record: dict[str, Any]) -> list[tuple[float, str]]:
     were requested.
     """
     checks = (
+        _from_large_residuals,
         _from_residuals,
         _from_images,
         _from_resampling,
@@ -69,6 +77,17 @@ def contradictions(record: dict[str, Any]) -> list[tuple[float, str]]:
         _from_limits,
     )
     return [found for check in checks for found in check(record)]
+
+
+def _from_large_residuals(record: dict[str, Any]) -> list[tuple[float, str]]:
+    """Residuals that no beam explains, whatever the covariance takes them for.
+
+    Out of the image plane they would pass for offsets, which may have any SD.
+    """
+    rms, stated = record["rms_mm"], record["tre"]["stated_mm"]
+    if not rms or not stated or rms <= IMPLAUSIBLE_RMS_MM:
+        return []
+    return [(rms / stated, f"residuals of {rms:.1f} mm are larger than a beam is thick")]
 
 
 def _from_residuals(record: dict[str, Any]) -> list[tuple[float, str]]:
@@ -160,8 +179,13 @@ def _from_unmodelled(record: dict[str, Any]) -> list[tuple[float, str]]:
     those = ", ".join([*map(str, images[:MOST_IMAGES]), *more])
     words = {
         "scale": lambda: (
-            f"lateral positions that are too long by {100 * values[0]:.1f} % and ranges by "
-            f"{100 * values[1]:.1f} % would explain the errors far better: {lengths}"
+            f"lateral positions that are {_too_long(values[0])} and ranges that are "
+            f"{_too_long(values[1])} would explain the errors far better: {lengths}"
+        ),
+        "lateral": lambda: (
+            f"lateral positions that are {_too_long(values[0])} would explain the errors far "
+            "better: are the pixels as wide as stated? With a curved array, a wrong sound speed "
+            "stretches the image sideways, too: estimate the scale, not the sound speed"
         ),
         "slip": lambda: (
             f"an image that moves by {found['slip_mm']:.1f} mm on the probe from the first image "
