@@ -625,6 +625,9 @@ def test_the_figure_is_a_figure(tmp_path, count):
     last = figure.axes[2].lines[0].get_xydata()[-1]
     np.testing.assert_array_equal(last, [count, plan.tre_mm[-1]])
     assert (tmp_path / "plan.png").read_bytes().startswith(b"\x89PNG")
+    # Not by colour alone, and every line of errors has a name.
+    assert len({line.get_marker() for line in figure.axes[1].lines}) == 2
+    assert not any(str(line.get_label()).startswith("_") for line in figure.axes[2].lines)
     # The marker is to the right and the person below, as in the words.
     bounds, model = plan.candidates.constraints, plan.candidates.model
     for which, line in zip((~plan.filling, plan.filling), figure.axes[1].lines, strict=True):

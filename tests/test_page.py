@@ -17,6 +17,7 @@ from conftest import experiment
 import jaxcal
 from jaxcal.report import svg
 from jaxcal.report.page import page, write_page
+from jaxcal.report.paragraphs import as_html
 from jaxcal.report.record import calibration_record
 from jaxcal.result.saved import load_calibration
 
@@ -190,8 +191,10 @@ def test_a_failed_solve_has_a_page_too(record, result, recording, status, word):
 
 def test_wrong_frames_leave_nothing_to_copy(record, result, recording):
     told = "the poses are inverted: tracker to probe"
-    text = page({**record, "wrong_frames": told, "verdict": None}, result, recording)
+    wrong = {**record, "wrong_frames": told, "verdict": None, "warnings": [told]}
+    text = page(wrong, result, recording)
     assert f"Do not use: {told}." in text
+    assert "What to look at" not in text
     assert 'id="form-' not in text
     assert "How accurate" not in text
 
@@ -240,6 +243,36 @@ def test_error_map_of_any_size_tells_its_scales(wide, deep):
     assert (places < height).all()
     for length in map(float, re.findall(r">([0-9.]+) mm</text>", drawn)):
         assert wide / 12 < length <= wide / 4
+
+
+@pytest.mark.parametrize("largest", [3e-6, 0.0011, 0.012, 0.3, 4000.0])
+def test_a_label_has_room_beside_the_numbers_of_its_axis(largest):
+    drawn = svg.series([("x (mm)", [0, 1], [-largest, largest], svg.BLUE)], [], "few")
+    label = float(re.findall(r'<text x="([0-9.]+)"[^>]*class="label" transform', drawn)[0])
+    ends = re.findall(r'<text x="([0-9.]+)"[^>]*text-anchor="end" class="tick">([^<]*)<', drawn)
+    # 9 px type of 0.64 em a digit, as wide as any, and half of a label of 10 px.
+    assert label + 5 < min(float(end) - 5.76 * len(words) for end, words in ends) + 2
+    assert label > 5
+
+
+def test_shares_are_readable_on_every_colour():
+    def luminance(colour):
+        parts = [int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5)]
+        return np.dot([0.2126, 0.7152, 0.0722], [((v + 0.055) / 1.055) ** 2.4 for v in parts])
+
+    kinds = [(colour, 1 / 3, colour) for colour in (svg.BLUE, svg.GREEN, svg.ORANGE)]
+    inks = re.findall(r"fill:(#[0-9a-f]{3})", svg.stacked([("error", kinds)], "shares"))
+    for (_, _, colour), ink in zip(kinds, inks, strict=True):
+        dark, light = sorted((luminance(colour), {"#000": 0.0, "#fff": 1.0}[ink]))
+        assert (light + 0.05) / (dark + 0.05) > 4.5, colour
+
+
+def test_a_number_stays_with_its_unit_on_a_page():
+    shown = as_html(["Good: 95 % of 3.2 mm:", "- log density +5.0 +- 1.2", "- 6 SDs < 7"])
+    assert shown == (
+        "<p>Good: 95&nbsp;% of 3.2&nbsp;mm:</p>"
+        "<ul><li>log density +5.0 ± 1.2</li><li>6&nbsp;SDs &lt; 7</li></ul>"
+    )
 
 
 @pytest.mark.parametrize(("low", "high"), [(0.2, 0.58), (-3.1, 2.2), (0.0, 1e-4), (-71.0, 88.0)])

@@ -70,6 +70,7 @@ def test_saved_by_the_name_of_the_recordings_frame(result, tmp_path):
 
 def test_notebooks_get_a_drawing_and_no_script(result):
     html = result._repr_html_()
+    assert "<p>- " not in html
     assert "<svg" in html
     assert f"{np.asarray(result.image_to_probe)[0, 3]:.6f}" in html
     assert "<script" not in html

@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -21,7 +22,7 @@ from jaxcal.report.paragraphs import laid_out, listed
 from jaxcal.report.plots import convergence_figure, plot_offsets, plot_residuals
 from jaxcal.report.record import calibration_record, check_test_images, plain, truth_error
 from jaxcal.report.tables import calibration_table, comparison_table, frames_and_target
-from jaxcal.report.verdict import frames_of_images, verdict
+from jaxcal.report.verdict import certainty, frames_of_images, verdict
 from jaxcal.report.write import COLUMNS, prepare_folder, write_report
 from jaxcal.result.calibration import Status
 from jaxcal.solvers.plan import Options
@@ -562,6 +563,25 @@ def test_prepare_folder_refuses(tmp_path, path):
     with pytest.raises(OutputError, match=r"^[^\n]+$"), prepare_folder(tmp_path / path):
         pass
     assert [item.name for item in tmp_path.iterdir()] == ["file"]
+
+
+def test_small_errors_are_not_shown_as_zero(record):
+    tiny = 3e-3
+    spread = np.diag([(0.1 * tiny) ** 2] * 6)
+    small = {
+        **record,
+        "rms_mm": tiny, "sigma_lateral_mm": 0.2 * tiny, "point_covariance_mm2": spread[:3, :3],
+        "covariance": np.radians(spread), "limits": None, "status": "converged",
+        "observability": {**record["observability"], "weakest_sd_mm": tiny},
+    }  # fmt: skip
+    text = text_of(calibration_table(small))
+    assert not re.search(r"(?<![0-9.])0\.0+(?![0-9])", text.split("method")[1])
+    assert "SD 0.0030 mm" in " ".join(text.split())
+    assert not any(re.search(r"\b0\.0+ degrees", line) for line in certainty(small))
+    found = {"poses": [{"words": "tilt"}], "tre_now_mm": 0.0841, "tre_then_mm": 0.0813,
+             "images_to_half": None}  # fmt: skip
+    told = next_poses_sentences({"next_poses": found, "tre": {"rms_mm": 0.0841}})
+    assert "from 0.084 to 0.081 mm" in told[0]
 
 
 @pytest.mark.parametrize(("count", "words"), [(1, "1 more image,"), (2, "2 more images,")])

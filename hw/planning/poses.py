@@ -262,7 +262,7 @@ def preview(plan: PosePlan, path: Path, box_mm: Float[np.ndarray, "2 3"] | None 
     first, second, along = (axial @ looking_rotation(plan.scene.looking)).T
     tilt = np.degrees(np.arccos(np.clip(along, -1, 1)))
     cone.scatter(np.arctan2(second, first), tilt, c=np.arange(len(plan)), s=16)
-    cone.set_title("axial direction: tilt (degrees)")
+    cone.set_title("axial direction: tilt (degrees)", pad=18)
 
     image = figure.add_subplot(1, 3, 3)
     dots = image.scatter(*plan.expected.T, c=np.arange(len(plan)), s=16)

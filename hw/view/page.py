@@ -367,7 +367,7 @@ def _estimate_words(estimate: dict[str, Any] | None) -> list[str]:
         return ["no estimate yet: it takes four images"]
     transform = np.reshape(estimate["image_to_probe"], (4, 4))
     point, covariance = estimate["point"], estimate["covariance"]
-    rows = ["| running estimate | mm | SD |", "| --- | --- | --- |"]
+    rows = ["| running estimate | mm | SD (mm) |", "| --- | --- | --- |"]
     spread = ["?"] * 3
     if covariance is not None:
         # The covariance is in the image's axes, the origin's position in the probe's.

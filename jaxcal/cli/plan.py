@@ -374,7 +374,7 @@ def _print(
             str(found.known.images + k + 1),
             pose["words"] + sign,
             f"{lateral:.0f}, {depth:.0f}",
-            f"{pose['tre_mm']:.3g}",
+            f"{pose['tre_mm']:#.3g}",
         )
     there = found.known.images
     counts = [

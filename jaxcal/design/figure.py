@@ -44,13 +44,16 @@ def plan_figure(plan: Plan, wanted_mm: float | None = None) -> Figure:
     outline = np.concatenate([a + steps * (b - a) for a, b in pairwise(edge)])
     outline = bounds.region.place(outline)
     image.plot(outline[:, 0], outline[:, 2], color=_GREY, linewidth=0.8)
-    for which, colour, label in ((~filling, _BLUE, "chosen"), (filling, _ORANGE, "fills space")):
+    for which, colour, shape, label in (
+        (~filling, _BLUE, "o", "chosen"),
+        (filling, _ORANGE, "^", "fills space"),
+    ):
         places = plan.targets[which]
-        image.plot(places[:, 0], places[:, 2], "o", color=colour, markersize=4, label=label)
+        image.plot(places[:, 0], places[:, 2], shape, color=colour, markersize=4, label=label)
         # Where the handle goes, as in words.py: the marker is to the right, the person below.
         azimuth = np.arctan2(-numbers[which, 2], -numbers[which, 3])
         tilt = np.degrees(np.hypot(numbers[which, 2], numbers[which, 3]))
-        cone.plot(azimuth, tilt, "o", color=colour, markersize=4, clip_on=False)
+        cone.plot(azimuth, tilt, shape, color=colour, markersize=4, clip_on=False)
     image.set(
         xlabel="lateral (mm)", ylabel="depth (mm)", title="target in the image", aspect="equal"
     )
@@ -70,14 +73,14 @@ def plan_figure(plan: Plan, wanted_mm: float | None = None) -> Figure:
     count = plan.known.images + np.arange(len(plan.tre_mm))
     # Errors of the first few images are so large that they would hide the others.
     seen = count >= min(6, count[-1])
-    for values, colour, label in (
-        (plan.tre_mm, _BLUE, "TRE"),
-        (plan.rp_mm, _ORANGE, "reconstruction precision"),
+    for values, colour, style, label in (
+        (plan.tre_mm, _BLUE, "o-", "target registration error"),
+        (plan.rp_mm, _ORANGE, "^-", "reconstruction precision"),
     ):
-        errors.plot(count[seen], values[seen], ".-", color=colour, label=label)
+        errors.plot(count[seen], values[seen], style, color=colour, markersize=3, label=label)
     errors.set_xlim(count[seen][0] - 0.5, count[-1] + 0.5)
     if wanted_mm is not None:
-        errors.axhline(wanted_mm, color=_GREY, linewidth=0.8, linestyle="--")
+        errors.axhline(wanted_mm, color=_GREY, linewidth=0.8, linestyle="--", label="wanted")
     errors.set(
         xlabel="images", ylabel="predicted error (mm)", yscale="log", title="how many images?"
     )

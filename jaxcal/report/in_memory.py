@@ -90,6 +90,7 @@ def batch_text(calibration: Calibration) -> str:
 def html_of(calibration: Calibration) -> str:
     """Verdict, error map and numbers for a notebook, without script and with their own styles."""
     from jaxcal.report.page import map_of_error
+    from jaxcal.report.paragraphs import as_html
     from jaxcal.report.verdict import title_of_transform, verdict
 
     record = record_of(calibration)
@@ -101,11 +102,10 @@ def html_of(calibration: Calibration) -> str:
         "<tr>" + "".join(f"<td style='text-align:right'>{_cell(v)}</td>" for v in row) + "</tr>"
         for row in record["image_plane_to_probe"]
     )
-    items = "".join(f"<p>{escape(line)}</p>" for line in lines)
     return (
         "<style>.jaxcal{--text:currentColor;--line:#888;--grid:#8884;max-width:46em}"
         ".jaxcal svg{max-width:26em;width:100%}.jaxcal svg text{fill:currentColor;font-size:10px}"
-        f"</style><div class='jaxcal'>{drawn}{items}<table><caption>"
+        f"</style><div class='jaxcal'>{drawn}{as_html(lines)}<table><caption>"
         f"{escape(title_of_transform(record))}</caption>{matrix}</table></div>"
     )
 

@@ -94,7 +94,9 @@ def next_poses_sentences(record: dict[str, Any]) -> list[str]:
     # More images do not help against an error that the noise model leaves out.
     beside = bool(tre.get("contradictions"))
     error = "error by the noise model alone" if beside else "predicted error"
-    gain = f" that reduce the {error} from {now:.2f} to {then:.2f} mm" if stated else ""
+    # As many digits as tell the two numbers apart.
+    form = next((f for f in (".2f", ".3f", ".4f") if f"{now:{f}}" != f"{then:{f}}"), ".2g")
+    gain = f" that reduce the {error} from {now:{form}} to {then:{form}} mm" if stated else ""
     lines = listed(
         f"What would help most: {len(found['poses'])} images{gain}. From the middle orientation, "
         "with the marker to your right",

@@ -28,13 +28,14 @@ from jaxcal.io.outputs import check_output
 from jaxcal.report import svg
 from jaxcal.report.certified import certificate_words
 from jaxcal.report.next_poses import next_poses_sentences
-from jaxcal.report.paragraphs import BULLET, listed
+from jaxcal.report.paragraphs import BULLET, as_html, listed
 from jaxcal.report.resampled import resampled_sentences
 from jaxcal.report.tables import frames_and_target, further_facts
 from jaxcal.report.verdict import (
     advice,
     believe,
     certainty,
+    fine_form,
     frames_of_images,
     headline,
     length_form,
@@ -173,19 +174,9 @@ def _length(record: dict[str, Any], path: str, unit: str = "") -> str:
     return _number(record, path, length_form(_value(record, path) or 0.0), unit)
 
 
-def _paragraphs(lines: list[str]) -> str:
-    """Sentences and lists (:mod:`jaxcal.report.paragraphs`)."""
-    parts, items = [], []
-    for text in [*lines, ""]:
-        if text.startswith(BULLET):
-            items.append(f"<li>{escape(text[len(BULLET) :])}</li>")
-            continue
-        if items:
-            parts.append(f"<ul>{''.join(items)}</ul>")
-            items = []
-        if text:
-            parts.append(f"<p>{escape(text)}</p>")
-    return "".join(parts)
+def _fine(record: dict[str, Any], path: str, unit: str = "") -> str:
+    """The same with as many digits as in the table of a terminal."""
+    return _number(record, path, fine_form(_value(record, path) or 0.0), unit)
 
 
 def _section(title: str, *parts: str) -> str:
@@ -228,19 +219,20 @@ def _head(record: dict[str, Any]) -> str:
         f"jaxcal {escape(record['jaxcal_version'])}</p></header>"
         f'<div class="verdict {kind}"><div class="word">{escape(verdict_word(record))}</div>'
         f"{number}</div>"
-        f"{_paragraphs(said)}"
+        f"{as_html(said)}"
     )
 
 
 def _findings(record: dict[str, Any]) -> str:
     """What looks wrong, from all checks, and what to do about it."""
     parts = []
-    if found := record["warnings"]:
-        parts += ["<h3>Look at this</h3>", _paragraphs([BULLET + text for text in found])]
+    first = headline(record)
+    if found := [text for text in record["warnings"] if text not in first]:
+        parts += ["<h3>Look at this</h3>", as_html([BULLET + text for text in found])]
     if todo := advice(record):
-        parts += ["<h3>What to do</h3>", _paragraphs([BULLET + text for text in todo])]
+        parts += ["<h3>What to do</h3>", as_html([BULLET + text for text in todo])]
     if more := next_poses_sentences(record):
-        parts += ["<h3>Which images to add</h3>", _paragraphs(more)]
+        parts += ["<h3>Which images to add</h3>", as_html(more)]
     return _section("What to look at, and what to do", *parts) if parts else ""
 
 
@@ -349,7 +341,10 @@ def _scene(record: dict[str, Any], answer: Calibration, recording: Recording) ->
     }
     close = _close_up(answer, cloud, shown)
     ellipsoid = " with its 95 % ellipsoid (lines)" if close["lines"] else ""
-    all_images = "Planes of the images (blue) and the target (orange), in the tracker's frame."
+    all_images = (
+        "Planes of the images (blue, with a dot where lateral position and depth are zero) and the "
+        "target (orange), in the tracker's frame."
+    )
     by_image = (
         "The target's position by each image (green; orange: an image that does not fit the "
         f"rest), and its estimate{ellipsoid}."
@@ -397,7 +392,7 @@ def _close_up(
         {
             "at": _rounded(place),
             "r": 2.2,
-            "title": f"image {image}, {apart:.2f} mm",
+            "title": f"image {image}, {apart:.3g} mm",
             "colour": svg.ORANGE if image in named else svg.GREEN,
         }
         for place, image, apart in zip(cloud, shown.tolist(), away, strict=True)
@@ -477,7 +472,7 @@ def _residuals(record: dict[str, Any], answer: Calibration) -> str:
             f"of each {-(-2 * len(used) // svg.MOST_DRAWN)} successive ones.",
         )
     columns = "".join(f"<div>{part}</div>" for part in parts)
-    return _section("Image by image", f'<div class="grid">{columns}</div>', _paragraphs(words))
+    return _section("Image by image", f'<div class="grid">{columns}</div>', as_html(words))
 
 
 def _limits(record: dict[str, Any]) -> str:
@@ -499,9 +494,9 @@ def _limits(record: dict[str, Any]) -> str:
     return _section(
         "Where the errors come from",
         f"<figure>{drawn}</figure><p>Standard deviations found: {sds}. Residual, root mean square: "
-        f"{_number(record, 'rms_mm', '.3f', 'mm')}, of which "
-        f"{_number(record, 'limits.rms_in_plane_mm', '.3f', 'mm')} in the image plane and "
-        f"{_number(record, 'limits.rms_elevational_mm', '.3f', 'mm')} out of it.</p>",
+        f"{_fine(record, 'rms_mm', 'mm')}, of which "
+        f"{_fine(record, 'limits.rms_in_plane_mm', 'mm')} in the image plane and "
+        f"{_fine(record, 'limits.rms_elevational_mm', 'mm')} out of it.</p>",
         '<p class="soft">The upper bar is about the calibration. The lower one is about how the '
         "target was imaged and picked, which no calibration can improve.</p>",
     )
@@ -512,15 +507,18 @@ def _comparison(record: dict[str, Any]) -> str:
     if beside is None:
         return ""
 
-    def number(name: str, form: str = ".3f") -> str:
+    def number(name: str, form: str) -> str:
         return _number(record, f"comparison.{name}", form)
 
+    def length(name: str) -> str:
+        return _fine(record, f"comparison.{name}")
+
     rows = [
-        ("residual, root mean square (mm)", number("conventional_rms_mm"), number("rms_mm")),
+        ("residual, root mean square (mm)", length("conventional_rms_mm"), length("rms_mm")),
         (
-            "expected error from the estimated noise (mm)",
-            number("conventional_tre_mm"),
-            number("tre_mm"),
+            "expected error, if independent and Gaussian (mm)",
+            length("conventional_tre_mm"),
+            length("tre_mm"),
         ),
     ]
     if beside["log_density_gain"] is not None:
@@ -529,7 +527,7 @@ def _comparison(record: dict[str, Any]) -> str:
     return _section(
         "Comparison with the conventional fit",
         _table(rows, ("", "conventional", escape(record["method"]))),
-        _paragraphs(believe(record)),
+        as_html(believe(record)),
     )
 
 
@@ -541,7 +539,7 @@ def _observability(record: dict[str, Any]) -> str:
     proved = certificate_words(record)
     if proved is not None:
         words.append(f"{proved[0].upper()}{proved[1:]}.")
-    parts = [_paragraphs(words)]
+    parts = [as_html(words)]
     if usable(record) and record["image_covariance"] is not None:
         covariance = np.array(record["image_covariance"], float)
         sd = np.sqrt(np.diagonal(covariance))
@@ -576,6 +574,8 @@ def _plain(name: str) -> str:
 def _in_unit(name: str, sd: float) -> str:
     if name.endswith("_rad"):
         return f"{math.degrees(sd):.3g} deg"
+    if name == "delay":
+        return f"{sd:.3g} mm of distance"
     return f"{100 * sd:.3g} %" if name.startswith("log_") else f"{sd:.3g} mm"
 
 

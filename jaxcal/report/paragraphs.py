@@ -6,10 +6,15 @@ one that ends with a colon, with points after it, is their heading.
 
 from __future__ import annotations
 
+import re
 import textwrap
 from collections.abc import Sequence
+from html import escape
 
 BULLET = "- "
+
+_UNITS = re.compile(r"(\d) (%|mm\b|SDs?\b|degrees?\b)")
+"""A number and its unit, which a line break must not separate."""
 
 
 def listed(heading: str, points: Sequence[str]) -> list[str]:
@@ -35,3 +40,20 @@ def laid_out(lines: Sequence[str], width: int) -> str:
             )
         )
     return "\n".join(told)
+
+
+def as_html(lines: Sequence[str]) -> str:
+    """Paragraphs and lists of HTML; the text is escaped."""
+    parts, items = [], []
+    for text in [*lines, ""]:
+        shown = _UNITS.sub(r"\1&nbsp;\2", escape(text.removeprefix(BULLET)))
+        shown = shown.replace(" +- ", " ± ")
+        if text.startswith(BULLET):
+            items.append(f"<li>{shown}</li>")
+            continue
+        if items:
+            parts.append(f"<ul>{''.join(items)}</ul>")
+            items = []
+        if text:
+            parts.append(f"<p>{shown}</p>")
+    return "".join(parts)

@@ -25,7 +25,7 @@ from jaxcal.model.image_points import mean_of_squares
 from jaxcal.report.accuracy import error_shares, region_of, scatter_shares
 from jaxcal.report.convergence import Curve
 from jaxcal.report.in_memory import recording_of
-from jaxcal.report.svg import BLUE, GREEN, ORANGE, bar_length, drawn, spread_out
+from jaxcal.report.svg import BLUE, GREEN, ORANGE, bar_length, drawn, ink, spread_out
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.given_values import real_array
@@ -171,7 +171,8 @@ def plot_offsets(calibration: Calibration, truth: Float[np.ndarray, " n"] | None
         panel.plot(*at_bound, "s", ms=5, mfc="none", mec=GREEN, mew=0.8, label="at its bound")
     if truth is not None:
         panel.plot(used[shown], truth[used[shown]], "x", color="black", ms=3, mew=0.7, label="true")
-    _legend(panel)
+    # Above the panel: in it, the legend would hide offsets.
+    _legend(panel, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3)
     panel.set(xlabel="image", ylabel="elevational offset (mm)")
     styled(side).hist(offset, bins="fd", orientation="horizontal", color=ORANGE, alpha=0.8)
     side.set_xlabel("images")
@@ -226,7 +227,7 @@ def plot_limits(calibration: Calibration) -> Figure:
                 row, share, left=left, color=COLOURS[kind], height=0.6, label=kind if row else None
             )
             told = f"{100 * share:.0f} %" if share > 0.05 else ""
-            panel.bar_label(bar, [told], label_type="center", color="white", fontsize=7)
+            panel.bar_label(bar, [told], label_type="center", color=ink(COLOURS[kind]), fontsize=7)
             left += share
     panel.set_yticks([0, 1], rows)
     panel.set(xlim=(0, 1), xlabel="share of the mean square")

@@ -95,6 +95,15 @@ def bar_length(size: float) -> float:
     return float(f"{length:.3g}")
 
 
+def ink(colour: str) -> str:
+    """Black or white, whichever is easier to read on a colour like ``#0072B2``."""
+    parts = [int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5)]
+    linear = [v / 12.92 if v <= 0.04045 else ((v + 0.055) / 1.055) ** 2.4 for v in parts]
+    luminance = sum(w * v for w, v in zip((0.2126, 0.7152, 0.0722), linear, strict=True))
+    # The contrasts of WCAG 2: (luminance + 0.05) / 0.05 with black, 1.05 / (...) with white.
+    return "#000" if (luminance + 0.05) ** 2 > 0.05 * 1.05 else "#fff"
+
+
 def number(value: Number) -> str:
     """A tick's label: no more digits than it needs, a true minus sign."""
     return f"{value:.6g}".replace("-", "−")
@@ -151,6 +160,12 @@ def figure(height: Number, parts: Iterable[str], label: str) -> str:
     )
 
 
+def width_of_ticks(values: Iterable[Number]) -> float:
+    """Distance of a y label from its axis, so that the numbers between them have room."""
+    longest = max((len(number(value)) for value in values), default=0)
+    return max(34.0, 11.0 + 5.8 * longest)
+
+
 @dataclass(frozen=True)
 class Panel:
     """A rectangle with two linear axes.
@@ -174,6 +189,11 @@ class Panel:
         share = (y - self.y[0]) / (self.y[1] - self.y[0])
         return across, top + (bottom - top) * (share if self.down else 1 - share)
 
+    def ticks_down(self) -> list[Any]:
+        """Round numbers along y."""
+        most = max(int((self.box[3] - self.box[1]) / 19), 3)
+        return ticks(*self.y, most)
+
     def axes(
         self,
         x_label: str = "",
@@ -192,8 +212,8 @@ class Panel:
             parts.append(line(across, top, across, bottom, "var(--grid)", 0.6))
             if x_label:
                 parts.append(text(across, bottom + 12, number(value), kind="tick"))
-        most_down = max(int((bottom - top) / 19), 3)
-        for value in ticks(*self.y, most_down):
+        down_ticks = self.ticks_down()
+        for value in down_ticks:
             down = self.place(self.x[0], value)[1]
             parts.append(line(left, down, right, down, "var(--grid)", 0.6))
             parts.append(text(left - 5, down + 3.2, number(value), "end", "tick"))
@@ -201,7 +221,8 @@ class Panel:
             parts.append(text(0.5 * (left + right), bottom + 27, x_label, kind="label"))
         if y_label:
             middle = 0.5 * (top + bottom)
-            parts.append(text(left - 34, middle, y_label, kind="label", turn=-90))
+            beside = left - width_of_ticks(down_ticks)
+            parts.append(text(beside, middle, y_label, kind="label", turn=-90))
         outline = 'fill="none" stroke="var(--line)" stroke-width="0.8"'
         parts.append(rect(left, top, right - left, bottom - top, outline))
         return parts
@@ -258,13 +279,14 @@ def series(
     images = np.concatenate([np.asarray(x, float) for _, x, _, _ in panels])
     first, last = (float(images.min()), float(images.max())) if len(images) else (0.0, 1.0)
     parts, rings = [], list(marked)
+    left = 14.0 + width_of_ticks(Panel((48.0, 0.0, 374.0, height), (0, 1), scale).ticks_down())
     for k, (name, x, y, colour) in enumerate(panels):
         top = 8.0 + k * (height + 12.0)
-        panel = Panel((48.0, top, 374.0, top + height), (first - 1, last + 1), scale)
+        panel = Panel((left, top, 374.0, top + height), (first - 1, last + 1), scale)
         below = "image" if k == len(panels) - 1 else ""
         parts += panel.axes(below, name, x_ticks=(first, last))
         zero = panel.place(first, 0.0)[1]
-        parts.append(line(48.0, zero, 374.0, zero, "var(--text)", 0.6))
+        parts.append(line(left, zero, 374.0, zero, "var(--text)", 0.6))
         ringed = np.isin(np.asarray(x, int), rings)
         shown = drawn(np.asarray(y, float), np.flatnonzero(ringed))
         ringed = ringed[shown]
@@ -272,7 +294,7 @@ def series(
         if half is not None:
             parts.append(panel.bars(x, y - half[shown], y + half[shown], GREY))
         pairs = list(zip(x, y, strict=True))
-        titles = [f"image {int(a)}: {b:.3f}" if len(x) <= 300 else "" for a, b in pairs]
+        titles = [f"image {int(a)}: {b:.4g}" if len(x) <= 300 else "" for a, b in pairs]
         parts += panel.stems(x, y, colour, titles)
         ring = f'fill="none" stroke="{ORANGE}" stroke-width="1.4"'
         parts += [circle(*panel.place(x[k], y[k]), 5, ring) for k in np.flatnonzero(ringed)]
@@ -317,7 +339,7 @@ def error_map(
             # A stroke of the same colour closes the gaps between cells.
             cells.append(
                 f'<polygon points="{outline}" fill="{colour}" stroke="{colour}" '
-                f'stroke-width="0.6"><title>{mean:.3f} mm</title></polygon>'
+                f'stroke-width="0.6"><title>{mean:.3g} mm</title></polygon>'
             )
     parts = [*panel.axes("lateral (mm)", "depth (mm)"), *cells]
     for a, b in spread_out(seen):
@@ -370,7 +392,7 @@ def stacked(rows: Sequence[tuple[str, Sequence[tuple[str, Any, str]]]], label: s
             if share > 0.09:
                 parts.append(
                     f'<text x="{_at(left + wide / 2)}" y="{_at(top + 26)}" text-anchor="middle" '
-                    f'class="tick" style="fill:#fff">{100 * share:.0f} %</text>'
+                    f'class="tick" style="fill:{ink(colour)}">{100 * share:.0f} %</text>'
                 )
             left += wide
     under = 6.0 + 46.0 * len(rows)

@@ -10,7 +10,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 
 from jaxcal.report.certified import certificate_words
-from jaxcal.report.verdict import spread_of_transform, title_of_transform
+from jaxcal.report.verdict import fine_form, length_form, spread_of_transform, title_of_transform
 from jaxcal.result.saved import ASKED_FOR
 from jaxcal.runtime.messages import counted
 
@@ -66,7 +66,7 @@ def comparison_table(records: dict[str, dict[str, Any]], milliseconds: dict[str,
 def _facts(record: dict[str, Any]) -> list[tuple[str, str]]:
     prior = "" if record["prior"] == "none" else f", {record['prior']} prior"
     kinds = ("lateral", "range", "elevation")
-    lateral, along, elevational = (_number(record[f"sigma_{kind}_mm"], ".3f") for kind in kinds)
+    lateral, along, elevational = (_size(record[f"sigma_{kind}_mm"]) for kind in kinds)
     facts = [
         *_accuracy(record),
         ("method", f"{record['method']}{prior}"),
@@ -77,22 +77,24 @@ def _facts(record: dict[str, Any]) -> list[tuple[str, str]]:
         ("residual RMS (mm)", _residuals(record)),
         (
             f"reconstruction precision, {record['reconstruction_precision_set']} images (mm)",
-            _number(record["reconstruction_precision_mm"], ".3f"),
+            _size(record["reconstruction_precision_mm"]),
         ),
     ]
     if (proved := certificate_words(record)) is not None:
         facts.append(("global minimum", proved))
     if (spread := spread_of_transform(record)) is not None:
-        facts.append(("SD of image_plane_to_probe", f"{spread[0]:.3f} mm, {spread[1]:.3f} deg"))
+        facts.append(
+            ("SD of image_plane_to_probe", f"{_size(spread[0])} mm, {_size(spread[1])} deg")
+        )
     facts += further_facts(record)
     sight = record["observability"]
     # If the direction is not determined at all, the SD only shows where rounding begins.
     sd = sight["weakest_sd_mm"] if record["status"] != "unobservable" else None
-    told = "" if sd is None else f" (SD {sd:.2f} mm)"
+    told = "" if sd is None else f" (SD {sd:{length_form(sd)}} mm)"
     facts.append(("least well determined", sight["weakest_direction"] + told))
     if "truth_error" in record:
         names = ("translation_mm", "rotation_deg", "point_mm")
-        moved, turned, target = (_number(record["truth_error"][name], ".3f") for name in names)
+        moved, turned, target = (_size(record["truth_error"][name]) for name in names)
         facts.append(("error against truth", f"{moved} mm, {turned} deg; target {target} mm"))
     return facts
 
@@ -132,7 +134,7 @@ def frames_and_target(record: dict[str, Any]) -> list[tuple[str, str]]:
         # A variance that is not known is null, one that is zero may be rounded to below.
         variances = [covariance[axis][axis] for axis in range(3)]
         sd = [None if each is None else math.sqrt(max(each, 0.0)) for each in variances]
-        facts.append(("SD of the target (mm)", _numbers(sd, ".3f")))
+        facts.append(("SD of the target (mm)", ", ".join(map(_size, sd))))
     return facts
 
 
@@ -143,8 +145,8 @@ def _accuracy(record: dict[str, Any]) -> list[tuple[str, str]]:
         return []
 
     def shown(error: float | None, interval: list[float | None]) -> str:
-        low, high = (_number(end, ".3f") for end in interval)
-        return f"{_number(error, '.3f')}, 95 % interval {low} to {high}"
+        low, high = map(_size, interval)
+        return f"{_size(error)}, 95 % interval {low} to {high}"
 
     facts = [("error to expect at the image (mm)", shown(tre["rms_mm"], tre["interval_95_mm"]))]
     for point in tre["points"]:
@@ -159,13 +161,18 @@ def _accuracy(record: dict[str, Any]) -> list[tuple[str, str]]:
 
 def _residuals(record: dict[str, Any]) -> str:
     found = record.get("limits")
-    whole = _number(record["rms_mm"], ".3f")
+    whole = _size(record["rms_mm"])
     if found is None:
         return whole
     return (
-        f"{whole}: {_number(found['rms_in_plane_mm'], '.3f')} in the image plane, "
-        f"{_number(found['rms_elevational_mm'], '.3f')} out of it"
+        f"{whole}: {_size(found['rms_in_plane_mm'])} in the image plane, "
+        f"{_size(found['rms_elevational_mm'])} out of it"
     )
+
+
+def _size(value: float | None) -> str:
+    """A length (mm) or an angle (degrees) that is not negative."""
+    return _UNKNOWN if value is None else format(value, fine_form(value))
 
 
 def _number(value: float | None, form: str) -> str:

@@ -121,7 +121,22 @@ def title_of_transform(record: dict[str, Any]) -> str:
 
 def length_form(value: float) -> str:
     """The format of a length in mm: hundredths; tenths from 10 mm on; more digits near zero."""
-    return ".1f" if value >= 10 else ".2f" if value >= 0.0095 else ".4f"
+    if value >= 10:
+        return ".1f"
+    if value >= 0.0095 or value == 0:
+        return ".2f"
+    return ".4f" if value >= 5e-5 else ".1g"
+
+
+def fine_form(value: float) -> str:
+    """The same for a table: thousandths; more digits near zero, so that none is shown as zero."""
+    if value >= 0.0095 or value == 0:
+        return ".3f"
+    return ".5f" if value >= 5e-6 else ".1g"
+
+
+def _fine(value: float) -> str:
+    return f"{value:{fine_form(value)}}"
 
 
 def _mm(value: float | None) -> str:
@@ -275,17 +290,18 @@ def believe(record: dict[str, Any]) -> list[str]:
         return []
     larger = (beside["rms_mm"] or 0.0) > beside["conventional_rms_mm"]
     first = (
-        f"Its RMS residual is larger than that of the conventional fit ({beside['rms_mm']:.3f} "
-        f"against {beside['conventional_rms_mm']:.3f} mm), as it must be: the conventional fit "
+        f"Its RMS residual is larger than that of the conventional fit ({_fine(beside['rms_mm'])} "
+        f"against {_fine(beside['conventional_rms_mm'])} mm), as it must be: the conventional fit "
         "minimises exactly this."
         if larger
-        else f"Its RMS residual is that of the conventional fit ({beside['rms_mm']:.3f} against "
-        f"{beside['conventional_rms_mm']:.3f} mm)."
+        else f"Its RMS residual is that of the conventional fit ({_fine(beside['rms_mm'])} against "
+        f"{_fine(beside['conventional_rms_mm'])} mm)."
     )
     lines = [first]
     if beside["conventional_tre_mm"] is not None and beside["tre_mm"] is not None:
         lines.append(
-            "With errors of the estimated sizes, a fit with equal weights has an expected error of "
+            "With independent Gaussian errors of the estimated sizes (assumed for this comparison "
+            "only), a fit with equal weights has an expected error of "
             f"{_mm(beside['conventional_tre_mm'])}, one with weights from these sizes "
             f"{_mm(beside['tre_mm'])}"
         )
@@ -317,8 +333,8 @@ def certainty(record: dict[str, Any]) -> list[str]:
     about = max(range(3), key=lambda axis: record["covariance"][3 + axis][3 + axis])
     lines = [
         f"The image's position on the probe has a standard deviation of {_mm(spread[0])}, "
-        f"largest along its {_AXES[along]} axis. That of its orientation is {spread[1]:.2f} "
-        f"degrees, largest about its {_AXES[about]} axis."
+        f"largest along its {_AXES[along]} axis. That of its orientation is "
+        f"{spread[1]:{length_form(spread[1])}} degrees, largest about its {_AXES[about]} axis."
     ]
     unseen = record["observability"]["known_only_from_prior"]
     if unseen and record["prior"] in TUNED:

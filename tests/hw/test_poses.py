@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from matplotlib.image import imread
 
 from hw.acquisition.live_estimate import Estimator
 from hw.acquisition.planner import Planner
@@ -108,10 +109,11 @@ def test_bad_scenes_are_refused():
 
 def test_preview_is_a_figure(tmp_path):
     path = tmp_path / "plan.png"
-    plan = plan_poses(12, SCENE)
+    plan = plan_poses(6, SCENE)
     preview(plan, path)
     without = path.read_bytes()
     assert without.startswith(b"\x89PNG")
+    assert (imread(path)[[0, -1]] == 1).all()  # no title is cut off
     preview(plan, path, np.array([[180.0, -420.0, 40.0], [520.0, -80.0, 270.0]]))
     assert path.read_bytes() != without
 
