@@ -28,6 +28,7 @@ from hw.runtime.errors import LostError, RefusedError, StaleError
 from hw.runtime.rigid import ur_to_pose
 
 
+@pytest.mark.real_time
 @pytest.mark.parametrize("seconds", [1.5, pytest.param(60.0, marks=pytest.mark.slow)])
 def test_no_pose_is_lost_at_500_and_125_hz_at_once(seconds):
     with (
@@ -146,6 +147,7 @@ def test_a_mute_controller_makes_poses_stale_and_then_lost():
         assert time.monotonic() - start < 120.0
 
 
+@pytest.mark.real_time
 def test_a_dropped_connection_is_lost_at_once():
     with EmulatedRobot() as robot, PoseStream(robot.host, clock=robot.clock) as poses:
         robot.ask("drop")
