@@ -62,6 +62,7 @@ def again_and_again(
         time.sleep(0.002)
 
 
+@pytest.mark.real_time
 def test_identity_and_tcp_offset():
     with EmulatedRobot() as robot, PoseStream(robot.host, clock=robot.clock) as poses:
         identity = poses.identity()
@@ -123,6 +124,7 @@ def test_payload_and_speed_slider_are_told():
         assert poses.pendant.changed(poses.pendant) == ""
 
 
+@pytest.mark.real_time
 def test_a_mute_controller_makes_poses_stale_and_then_lost():
     with EmulatedRobot() as robot:
         with PoseStream(robot.host, clock=robot.clock, timeout_s=2.0) as poses:
@@ -160,6 +162,7 @@ def test_nobody_there():
         PoseStream("127.250.250.1", timeout_s=0.5).start()
 
 
+@pytest.mark.real_time
 def test_averages_of_steady_poses():
     with EmulatedRobot() as robot, PoseStream(robot.host, clock=robot.clock) as poses:
         poses.drain()
@@ -267,6 +270,7 @@ def delaying(host: str, port: int, seconds: Callable[[bytes], float]) -> Iterato
         listener.shutdown(socket.SHUT_RDWR)
 
 
+@pytest.mark.real_time
 def test_poses_that_come_late_are_not_new():
     delay = [0.15]
 
@@ -294,6 +298,7 @@ def test_poses_that_come_late_are_not_new():
                 assert min(sample.lag_s for sample in slow.drain()) > 0.04
 
 
+@pytest.mark.real_time
 def test_one_slow_start_does_not_make_every_later_pose_look_old():
     starts = []
 
