@@ -588,7 +588,7 @@ def test_killed_and_resumed(tmp_path, capfd):
     path = tmp_path / "rec.h5"
     code = "import sys; from hw.cli.main import main; sys.exit(main(sys.argv[1:]))"
     arguments = ["acquire", str(path), "--bench", "--images", str(IMAGES), "--placement", "none",
-                 "--speed", "3", "--bench-seed", "3"]  # fmt: skip
+                 "--speed", "3", "--bench-seed", "3", "--controller", "e"]  # fmt: skip
     process = subprocess.Popen(
         [sys.executable, "-c", code, *arguments], stderr=subprocess.PIPE, text=True
     )
@@ -702,6 +702,7 @@ def test_a_resumed_run_compares_the_electronics(e_series, tmp_path):
     [
         None, {"unknown": 1}, {"images": "x"}, {"images": 10.5}, {"seed": -1}, {"bench": "x"},
         {"bench": 1.5}, {"phantom": ["x"]}, {"operator": 1}, {"until_tre_mm": "x"},
+        {"controller": "x"},
     ],
 )  # fmt: skip
 def test_a_request_in_a_file_is_not_trusted(asked):
