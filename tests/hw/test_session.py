@@ -33,7 +33,6 @@ from hw.recording.recorder import Recorder
 from hw.recording.session import DELAY_S, Session, Watch, frame_period
 from hw.runtime.clock import Clock
 from hw.runtime.errors import DeviceError, RefusedError, StaleError
-from hw.setup.check import _active_echo
 from hw.setup.description import Setup
 from jaxcal.data.probe import LinearProbe
 from jaxcal.io.openigtlink import Message
@@ -301,17 +300,3 @@ def test_a_suspension_is_no_fault_of_a_device(tmp_path, monkeypatch):
             monkeypatch.setattr("hw.recording.session._PERIOD_WALL_S", 1.0)
             time.sleep(0.4)
             assert "this program was suspended or held up for 0." in str(session.trouble())
-
-
-@pytest.mark.real_time
-def test_a_check_that_was_suspended_tells_the_true_rates():
-    """It counted what came in a longer time than it divided by."""
-    script = f"sleep 0.1; kill -STOP {os.getpid()}; sleep 0.5; kill -CONT {os.getpid()}"
-    scene = Scene(np.eye(4), np.array([400.0, -100.0, 0.0]), np.array([0.0, 0.0, -1.0]))
-    with AuspisEmulator(silence, clock=Clock(), rate_hz=40.0, lines=8) as emulator:
-        setup = Setup("127.250.250.1", emulator.path, scene, {}, probe=LinearProbe(elements=8))
-        with subprocess.Popen(["sh", "-c", script]):
-            facts = _active_echo(setup, 0.4).facts
-    rate = re.search(r"(\d+) frames/s", facts)
-    assert rate is not None
-    assert float(rate[1]) == pytest.approx(40.0, abs=8.0)
