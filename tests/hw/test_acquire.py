@@ -51,7 +51,7 @@ from hw.robot.motion_plan import MotionPlan
 from hw.robot.path_checks import check_plan
 from hw.runtime.errors import LostError, RefusedError, StoppedError
 from hw.runtime.keys import Pause
-from hw.setup.check import _ultrasound, check
+from hw.setup.check import _active_echo, check
 from hw.setup.description import Setup
 from hw.setup.emulated import setup_of, start
 from jaxcal import InputError, OutputError
@@ -613,12 +613,14 @@ def test_killed_and_resumed(tmp_path, capfd):
 
 
 @pytest.mark.real_time
-def test_a_check_that_was_suspended_blames_no_device(e_series):
-    """It saw one image, and said that every image is the same."""
-    script = f"sleep 0.05; kill -STOP {os.getpid()}; sleep 1.2; kill -CONT {os.getpid()}"
+def test_a_check_that_was_suspended_tells_the_true_rate(e_series):
+    """It counted what came in a longer time than it divided by."""
+    script = f"sleep 0.05; kill -STOP {os.getpid()}; sleep 1.0; kill -CONT {os.getpid()}"
     with subprocess.Popen(["sh", "-c", script]):
-        found = _ultrasound(setup_of(e_series), 0.9 * e_series.clock.speed)
-    assert found.wrong == ()
+        facts = _active_echo(setup_of(e_series), 0.4 * e_series.clock.speed).facts
+    rate = re.search(r"(\d+) frames/s", facts)
+    assert rate is not None
+    assert float(rate[1]) == pytest.approx(30.0, rel=0.2)
 
 
 def test_an_edited_plan_is_told_until_it_is_confirmed(e_series, tmp_path):
