@@ -10,7 +10,14 @@ import numpy as np
 from hw.planning.pool import allowed_by, plan_pool
 from hw.planning.poses import PosePlan, plan_poses
 from hw.recording.check import settings_of
-from hw.runtime.choices import OPERATORS, PHANTOMS, PLACEMENTS, PLACEMENTS_OF, PLANS
+from hw.runtime.choices import (
+    CONTROLLERS,
+    OPERATORS,
+    PHANTOMS,
+    PLACEMENTS,
+    PLACEMENTS_OF,
+    PLANS,
+)
 from hw.setup.description import Setup
 from jaxcal import InputError
 from jaxcal.io.given_files import naming
@@ -35,6 +42,7 @@ class AcquisitionRequest:
         until_tre_mm: with ``optimal``: stop once the predicted TRE is no larger than this.
         phantom: one of :data:`PHANTOMS`: what is in the tank. A cross-wire is placed and measured
             by what the images show, the other phantoms by the electronics.
+        controller: one of :data:`CONTROLLERS`: series of the emulated bench's robot.
     """
 
     images: int = 60
@@ -46,10 +54,12 @@ class AcquisitionRequest:
     plan: str = "sobol"
     until_tre_mm: float | None = None
     phantom: str = PHANTOMS[0]
+    controller: str = CONTROLLERS[0]
 
     def __post_init__(self) -> None:
         for name, choices in (
             ("phantom", PHANTOMS),
+            ("controller", CONTROLLERS),
             ("plan", PLANS),
             ("placement", PLACEMENTS),
             ("operator", OPERATORS),

@@ -144,8 +144,10 @@ def acquire(
         request = _recorded(recording, bench)
         bench_seed = request.bench
     else:
+        wanted["controller"] = controller
         request = _requested((bench_seed or 0) if bench else None, wanted)
     phantom, operator = request.phantom, request.operator
+    controller = controller or request.controller
     _check_installed(phantom, bench, move)
     path = recording or f"acquisition-{datetime.now():%Y%m%d-%H%M%S}.h5"
 

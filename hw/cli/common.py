@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 from click.core import ParameterSource
 
-from hw.runtime.choices import PHANTOMS
+from hw.runtime.choices import CONTROLLERS, PHANTOMS
 from jaxcal import InputError
 from jaxcal.cli.common import POSITIVE
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from hw.bench.run import Bench
     from hw.setup.description import Setup
 
-POSE_HZ = {"cb": 125, "e": 500}
+POSE_HZ: dict[str, int] = dict(zip(CONTROLLERS, (125, 500), strict=True))
 """Poses a second of a controller's series."""
 
 bench_option = click.option("--bench", is_flag=True, help="The emulated bench: no hardware at all.")
@@ -28,7 +28,7 @@ speed_option = click.option(
 )
 controller_option = click.option(
     "--controller",
-    type=click.Choice(list(POSE_HZ)),
+    type=click.Choice(CONTROLLERS),
     help="Emulated bench: series of the robot, CB (125 poses/s) or e-Series (500).  [default: cb]",
 )
 bench_seed_option = click.option(
@@ -71,7 +71,7 @@ def started(
 
     speed = SPEED if speed is None else speed
     return stack.enter_context(
-        start(seed or 0, speed, POSE_HZ[controller or "cb"], phantom or PHANTOMS[0])
+        start(seed or 0, speed, POSE_HZ[controller or CONTROLLERS[0]], phantom or PHANTOMS[0])
     )
 
 

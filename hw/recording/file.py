@@ -19,7 +19,7 @@ import io
 import os
 import secrets
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -56,6 +56,9 @@ _STEP_BYTES = 2**23
 
 _LARGEST_ARRAY = 2**28
 """Bytes; an array of /plan, /test or /truth has far fewer."""
+
+_BLOCK_BYTES = 2**22
+"""Read at once for the digest."""
 
 _END_OF_FILE = slice(40, 48)
 """Where a superblock of version 0 keeps the file's length, little endian."""
@@ -372,8 +375,11 @@ class RecordingWriter:
             with suppress(OSError):
                 temporary.unlink()
 
-    def finish(self) -> str:
+    def finish(self, busy: Callable[[], None] = lambda: None) -> str:
         """Mark the recording complete, close it, and write its SHA-256 beside it.
+
+        Args:
+            busy: called again and again while a large file is read.
 
         Returns:
             The hexadecimal digest of the file that was written; ``sha256sum -c`` reads the sidecar
@@ -387,11 +393,14 @@ class RecordingWriter:
         self._close_file()
         with open(os.dup(self._descriptor), "rb") as file:
             file.seek(0)
-            digest = hashlib.file_digest(file, "sha256").hexdigest()
+            digest = hashlib.sha256()
+            while block := file.read(_BLOCK_BYTES):
+                digest.update(block)
+                busy()
         self._check_place()
         self._forget()
-        write_text(_sidecar(self.path), f"{digest}  {self.path.name}\n")
-        return digest
+        write_text(_sidecar(self.path), f"{digest.hexdigest()}  {self.path.name}\n")
+        return digest.hexdigest()
 
     def _prepare(self, name: str, columns: Mapping[str, np.ndarray]) -> dict[str, h5py.Dataset]:
         if name not in LAYOUT:

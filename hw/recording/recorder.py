@@ -14,9 +14,8 @@ import json
 import os
 import pickle
 import threading
-import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, BinaryIO, NoReturn
 
@@ -24,6 +23,7 @@ import numpy as np
 
 from hw.recording.file import utc_now
 from hw.recording.layout import TEXT_BYTES, RecordingHeader
+from hw.runtime.clock import REAL, Waiting
 from hw.runtime.processes import finish, spawn
 from hw.runtime.rigid import ur_to_pose
 from jaxcal import CalibrationError, FormatError, OutputError
@@ -42,6 +42,7 @@ _PATIENCE_S = 30.0
 _ENDING_S = 30.0
 _HUNG_ENDING_S = 3.0
 """The same after the disk has taken nothing for so long that it was given up."""
+_TURN_S = 0.1
 
 
 class Recorder:
@@ -52,8 +53,8 @@ class Recorder:
         header: of a new file (see :class:`hw.recording.layout.RecordingHeader`).
         time_offset_s: added to host times, so that they go on where a resumed recording ended.
         queue_bytes: most bytes that may wait; continuous data beyond are dropped and counted.
-        patience_s: how long a selected image or the end may take, in wall-clock seconds, before
-            the disk is given up.
+        patience_s: for how long the disk may take nothing, in wall-clock seconds, before it is
+            given up.
 
     Raises:
         OutputError: the file is there already or cannot be written.
@@ -76,6 +77,8 @@ class Recorder:
         self._time_offset = time_offset_s
         self._queue: deque[bytes] = deque()
         self._waiting = 0
+        self._taken = 0
+        """How often the writer has taken or told something."""
         self._changed = threading.Condition()
         self._answers: dict[str, Any] = {}
         self.error: CalibrationError | None = None
@@ -355,14 +358,15 @@ class Recorder:
         """Queue a request (:mod:`hw.recording.writer_process`); False: there was no room."""
         data = pickle.dumps((do, arguments))
         size = len(data)
-        deadline = time.monotonic() + self._patience
+
+        def room() -> bool:
+            return not self._waiting or self._waiting + size <= self._capacity
+
         with self._changed:
-            while self._waiting and self._waiting + size > self._capacity:
+            if not wait and not room():
                 self._raise_error()
-                if not wait:
-                    return False
-                if not self._changed.wait(deadline - time.monotonic()):
-                    self._give_up(self._patience)
+                return False
+            self._wait_for(room, self._patience)
             self._raise_error()
             self._queue.append(data)
             self._waiting += size
@@ -371,13 +375,27 @@ class Recorder:
 
     def _answer(self, mark: str, patience_s: float | None = None) -> Any:
         patience = self._patience if patience_s is None else patience_s
-        deadline = time.monotonic() + patience
         with self._changed:
-            while mark not in self._answers:
-                self._raise_error()
-                if not self._changed.wait(deadline - time.monotonic()):
-                    self._give_up(patience)
+            self._wait_for(lambda: mark in self._answers, patience)
             return self._answers.pop(mark)
+
+    def _wait_for(self, done: Callable[[], bool], patience_s: float) -> None:
+        """Wait while the writer takes data, however much waits before.
+
+        A process that is suspended or held up does not wait meanwhile.
+
+        Raises:
+            OutputError: the writer failed, or has taken nothing for so long.
+        """
+        waiting, taken = Waiting(REAL), self._taken
+        while not done():
+            self._raise_error()
+            if self._taken != taken:
+                waiting, taken = Waiting(REAL), self._taken
+            left = patience_s - waiting.so_far()
+            if left <= 0:
+                self._give_up(patience_s)
+            self._changed.wait(min(left, _TURN_S))
 
     def _give_up(self, waited_s: float) -> NoReturn:
         """Fail for good: whatever is handed over next would wait as long."""
@@ -403,7 +421,12 @@ class Recorder:
             self._ending = self._ended = True
             self._changed.notify_all()
         ending_s = _HUNG_ENDING_S if self._hung else _ENDING_S
-        self._feeder.join(ending_s)
+        waiting, taken = Waiting(REAL), self._taken
+        while self._feeder.is_alive() and waiting.so_far() < ending_s:
+            self._feeder.join(min(ending_s, _TURN_S))
+            # A disk that was given up gets no more time, however it goes on.
+            if self._taken != taken and not self._hung:
+                waiting, taken = Waiting(REAL), self._taken
         stuck = self._feeder.is_alive()
         if stuck:
             # It takes no data. To close its pipe here would wait for the feeder, without end, or be
@@ -432,6 +455,7 @@ class Recorder:
                 pipe.flush()
                 with self._changed:
                     self._waiting -= len(data)
+                    self._taken += 1
                     self._changed.notify_all()
         except OSError:
             # The writer is gone; the listener knows why.
@@ -452,7 +476,9 @@ class Recorder:
                 self._fail(kind(answer["error"]))
                 continue
             with self._changed:
-                self._answers[answer["mark"]] = answer
+                self._taken += 1
+                if "mark" in answer:
+                    self._answers[answer["mark"]] = answer
                 self._changed.notify_all()
         if not self._ending:
             self._fail(OutputError(f"{self.path}: the writer ended; resume the recording"))

@@ -3,7 +3,8 @@
 Started by :class:`hw.recording.recorder.Recorder` only. A message is the name of a method of
 :class:`hw.recording.file.RecordingWriter` (or ``open``, ``sync``, ``finish``) and its arguments.
 New data are flushed to the file within about a second. When its standard input ends, the
-acquisition is gone, and it closes the file in order.
+acquisition is gone, and it closes the file in order. While it reads a large file for its
+digest, it says that it is busy.
 """
 
 from __future__ import annotations
@@ -110,7 +111,7 @@ def _serve(writer: RecordingWriter, messages: queue.Queue, answer: Callable[...,
             due = None
             answer(mark=arguments[0])
         elif do == "finish":
-            answer(mark="finish", sha256=writer.finish())
+            answer(mark="finish", sha256=writer.finish(lambda: answer(busy=True)))
             return
         else:
             getattr(writer, do)(*arguments)

@@ -37,7 +37,7 @@ import numpy as np
 
 from hw.robot.confirmation import Confirmation
 from hw.robot.motion_plan import MotionPlan
-from hw.robot.mover.messages import Setup, error_of, line_of, sample_of, told
+from hw.robot.mover.messages import WATCHDOG, Setup, error_of, line_of, sample_of, told
 from hw.robot.path_checks import check_plan
 from hw.robot.stream import PoseSample
 from hw.runtime.clock import HELD_UP_WALL_S, REAL, Clock
@@ -56,10 +56,7 @@ _START_PATIENCE_S, _START_TICK_S = 30.0, 0.1
 # The controller's watchdog has stopped the robot long before; a busy machine gets time to answer.
 _HANGS_WALL_S = 2.0
 _ENDING_WALL_S = 3.0
-_NO_ANSWER = (
-    "the controller does not answer, its own watchdog stops the robot. Motion needs a new "
-    "confirmation"
-)
+_NO_ANSWER = "the controller's answers are lost"
 _SUSPENDED_WALL_S = 10.0
 """After a longer suspension somebody may stand at the robot: it must not go on by itself."""
 
@@ -287,7 +284,7 @@ class Motion:
                 case "stopping":
                     stopping = error
                 case "hung":
-                    silence = LostError("the controller's answers are lost", device="robot")
+                    silence = LostError(_NO_ANSWER, device="robot")
             # Asked also while the robot brakes for a hesitation: it may tell of a danger now.
             told_now = self._ask_guard()
             hesitation = hesitation or told_now
@@ -303,7 +300,9 @@ class Motion:
                 error = self._stop or stopping or silence
                 self._in_motion = False
                 self._kill(error)
-                raise type(error)(f"{error.args[0]}; {_NO_ANSWER}", device="robot")
+                text = "; ".join(dict.fromkeys([error.args[0], silence.args[0]]))
+                text = text if WATCHDOG in text else f"{text}; {WATCHDOG}"
+                raise type(error)(text, device="robot")
 
     def _ask_guard(self) -> StaleError | None:
         """Ask the guard; a danger is latched and sent, a hesitation is returned."""
@@ -404,7 +403,7 @@ class Motion:
         finally:
             what, text = "error", "the motion process ended; the robot's own watchdog stops it"
             if self._process.wait() == -signal.SIGALRM:
-                what, text = "hung", _NO_ANSWER
+                what, text = "hung", f"{_NO_ANSWER}; {WATCHDOG}"
             self._answers.put({"what": what, "kind": "LostError", "text": text, "ended": True})
 
     def _note(self, t: float, command: str, values: dict[str, object]) -> None:

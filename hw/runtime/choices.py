@@ -14,6 +14,9 @@ PLACEMENTS_OF = {
 """Placements possible with each phantom, the default first: a cross-wire is not connected to the
 electronics, and a hydrophone never answers."""
 
+CONTROLLERS = ("cb", "e")
+"""Series of the emulated robot; the first is the default."""
+
 HAND_PLACEMENTS = ("none", "pattern-injection")
 """Placements of a hand-held probe; the first is the default."""
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -11,10 +12,14 @@ from hw.active_echo.device import ActiveEcho
 from hw.robot.identity import LOCAL
 from hw.robot.rtde import state_text
 from hw.robot.stream import PoseStream
-from hw.runtime.errors import DeviceError
+from hw.runtime.clock import Clock, Waiting
+from hw.runtime.errors import DeviceError, StaleError
 from hw.runtime.extras import missing
 from hw.setup.description import Setup
 from hw.ultrasound.receiver import UltrasoundStream
+
+_TURN_WALL_S = 0.1
+_Item = TypeVar("_Item")
 
 
 @dataclass(frozen=True)
@@ -85,16 +90,12 @@ def _active_echo(setup: Setup, seconds: float) -> Finding:
     wrong = []
     with ActiveEcho(setup.active_echo_url, clock=setup.clock, lines=setup.probe.elements) as echo:
         name, hz = echo.identify(), echo.clock_hz()
-        before = echo.trigger_count()
+        before, began = echo.trigger_count(), setup.clock.now()
         echo.stream(True)
-        frames = []
-        end = setup.clock.now() + seconds
-        with contextlib.suppress(DeviceError):
-            while setup.clock.now() < end:
-                frames.append(echo.read(min(1.0, seconds)))
+        frames = _come(echo.read, setup.clock, seconds)
         counts = echo.statistics()
         triggers = echo.trigger_count()
-        rate = (triggers[1] - before[1]) / seconds
+        rate = (triggers[1] - before[1]) / (setup.clock.now() - began)
         if triggers[1] == before[1]:
             wrong.append("no frame triggers come: is the ultrasound machine frozen or unplugged?")
         elif not frames:
@@ -116,13 +117,11 @@ def _active_echo(setup: Setup, seconds: float) -> Finding:
 
 def _ultrasound(setup: Setup, seconds: float) -> Finding:
     assert setup.ultrasound is not None
-    wrong, images = [], []
+    wrong = []
     with UltrasoundStream(*setup.ultrasound, clock=setup.clock) as stream:
-        end = setup.clock.now() + seconds
-        with contextlib.suppress(DeviceError):
-            while setup.clock.now() < end:
-                images.append(stream.read(max(1.0, seconds)))
-        counts = stream.statistics()
+        began = setup.clock.now()
+        images = _come(stream.read, setup.clock, seconds)
+        counts, watched = stream.statistics(), setup.clock.now() - began
     facts = "no images"
     if not images:
         wrong.append(
@@ -131,9 +130,27 @@ def _ultrasound(setup: Setup, seconds: float) -> Finding:
         )
     else:
         height, width = images[-1].array.shape
-        facts = f"{width} x {height} {images[-1].array.dtype}, {len(images) / seconds:.0f} images/s"
+        rate = counts.received / watched
+        facts = f"{width} x {height} {images[-1].array.dtype}, {rate:.0f} images/s"
         if all(np.array_equal(image.array, images[0].array) for image in images[1:]):
             wrong.append("every image is the same: is the machine frozen?")
     if counts.crc_errors:
         wrong.append(f"{counts.crc_errors} messages arrived damaged: look at the network")
     return Finding("ultrasound", facts, tuple(wrong))
+
+
+def _come(read: Callable[[float], _Item], clock: Clock, seconds: float) -> list[_Item]:
+    """What a stream sends while it is watched for some bench seconds, or until it is lost.
+
+    A process that is suspended or held up does not watch: what came meanwhile is still unread.
+    """
+    items: list[_Item] = []
+    waiting = Waiting(clock)
+    while waiting.so_far() < seconds:
+        try:
+            items.append(read(_TURN_WALL_S * clock.speed))
+        except StaleError:
+            continue
+        except DeviceError:
+            break
+    return items

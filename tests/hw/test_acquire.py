@@ -51,7 +51,7 @@ from hw.robot.motion_plan import MotionPlan
 from hw.robot.path_checks import check_plan
 from hw.runtime.errors import LostError, RefusedError, StoppedError
 from hw.runtime.keys import Pause
-from hw.setup.check import check
+from hw.setup.check import _active_echo, check
 from hw.setup.description import Setup
 from hw.setup.emulated import setup_of, start
 from jaxcal import InputError, OutputError
@@ -588,7 +588,7 @@ def test_killed_and_resumed(tmp_path, capfd):
     path = tmp_path / "rec.h5"
     code = "import sys; from hw.cli.main import main; sys.exit(main(sys.argv[1:]))"
     arguments = ["acquire", str(path), "--bench", "--images", str(IMAGES), "--placement", "none",
-                 "--speed", "3", "--bench-seed", "3"]  # fmt: skip
+                 "--speed", "3", "--bench-seed", "3", "--controller", "e"]  # fmt: skip
     process = subprocess.Popen(
         [sys.executable, "-c", code, *arguments], stderr=subprocess.PIPE, text=True
     )
@@ -610,6 +610,17 @@ def test_killed_and_resumed(tmp_path, capfd):
     assert "reconstruction precision" in done.stdout
     assert len(jaxcal.load(path)) == IMAGES
     np.testing.assert_array_equal(taken(path)[: len(before)], before)
+
+
+@pytest.mark.real_time
+def test_a_check_that_was_suspended_tells_the_true_rate(e_series):
+    """It counted what came in a longer time than it divided by."""
+    script = f"sleep 0.05; kill -STOP {os.getpid()}; sleep 1.0; kill -CONT {os.getpid()}"
+    with subprocess.Popen(["sh", "-c", script]):
+        facts = _active_echo(setup_of(e_series), 0.4 * e_series.clock.speed).facts
+    rate = re.search(r"(\d+) frames/s", facts)
+    assert rate is not None
+    assert float(rate[1]) == pytest.approx(30.0, rel=0.2)
 
 
 def test_an_edited_plan_is_told_until_it_is_confirmed(e_series, tmp_path):
@@ -702,6 +713,7 @@ def test_a_resumed_run_compares_the_electronics(e_series, tmp_path):
     [
         None, {"unknown": 1}, {"images": "x"}, {"images": 10.5}, {"seed": -1}, {"bench": "x"},
         {"bench": 1.5}, {"phantom": ["x"]}, {"operator": 1}, {"until_tre_mm": "x"},
+        {"controller": "x"},
     ],
 )  # fmt: skip
 def test_a_request_in_a_file_is_not_trusted(asked):

@@ -202,6 +202,7 @@ def test_help_needs_no_jax_and_no_drivers():
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.real_time
 def test_check_says_what_is_wrong_with_each_device(capsys):
     pytest.importorskip("serial", reason="needs jaxcal[serial]")
     status = main(["check", "--bench", "--speed", "4"])

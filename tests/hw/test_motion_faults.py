@@ -30,6 +30,7 @@ from motions import (
     sent,
 )
 from robots import CB_SERIES, E_SERIES, EmulatedRobot
+from suspending import suspend
 
 from hw.robot.identity import stop_program
 from hw.robot.motion import Motion
@@ -353,7 +354,7 @@ def test_a_stop_is_told_though_the_program_ended_at_the_same_moment():
     with EmulatedRobot(version=CB_SERIES) as robot, moving(robot) as motion:
         assert motion._process is not None
         # What comes while it is held up, it sees at once.
-        os.kill(motion._process.pid, signal.SIGSTOP)
+        suspend(motion._process.pid)
         robot.ask("payload", 2.0)
         assert stop_program(robot.host, timeout_s=2.0)
         os.kill(motion._process.pid, signal.SIGCONT)
@@ -444,7 +445,7 @@ def test_a_safety_stop_that_is_over_when_the_mover_looks_ends_motion():
     """A gate that was open for a moment; the robot would go on by itself."""
     with EmulatedRobot() as robot, moving(robot, caller_s=2.0) as motion:
         assert motion._process is not None
-        os.kill(motion._process.pid, signal.SIGSTOP)
+        suspend(motion._process.pid)
         robot.ask("robot_state", 7, 5)
         time.sleep(0.05)
         robot.ask("robot_state", 7, 1)
@@ -492,7 +493,7 @@ def test_a_process_that_does_not_read_a_long_setup_does_not_hold_up_the_start(mo
     while motion._process is None:
         time.sleep(0.001)
     process = motion._process
-    os.kill(process.pid, signal.SIGSTOP)
+    suspend(process.pid)
     try:
         thread.join(5.0)
         assert not thread.is_alive()

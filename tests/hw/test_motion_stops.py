@@ -358,7 +358,8 @@ def test_a_log_that_hangs_does_not_hold_up_who_is_told_of_the_end(monkeypatch):
         named = {"clock": robot.clock, "dry_run": False, "caller_s": 2.0}
         with Motion(robot.host, plan, given, log=log, **named) as motion:
             began = time.monotonic()
-            with pytest.raises(LostError, match="motion process does not respond"):
+            text = "motion process does not respond; the robot's own watchdog stops it"
+            with pytest.raises(LostError, match=text):
                 motion.move_to(PLAN.targets[2])
             assert time.monotonic() - began < 3.0
             assert robot.state()["velocity"] == [0.0] * 6

@@ -9,15 +9,20 @@ import resource
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from functools import partial
+from pathlib import Path
 from types import SimpleNamespace
 
 import h5py
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from suspending import suspend
 
 import jaxcal
 from hw.midplane.bracket import Bracket
@@ -140,7 +145,7 @@ def test_what_waits_is_written_though_closing_was_interrupted(tmp_path):
     """Ctrl-C twice: the first has put the run's end into the queue, the second comes meanwhile."""
     path = tmp_path / "rec.h5"
     recorder = Recorder(path, HEADER)
-    os.kill(recorder._process.pid, signal.SIGSTOP)
+    suspend(recorder._process.pid)
     recorder.add_event("stopped", "interrupted", 1.0)
     threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
     with pytest.raises(KeyboardInterrupt):
@@ -288,7 +293,7 @@ def test_kills_of_the_writer_at_any_moment(tmp_path, kills):
 def test_what_finds_no_room_is_dropped_and_counted_but_no_image_is(tmp_path):
     path, recording = tmp_path / "rec.h5", simulated()
     with Recorder(path, HEADER, queue_bytes=2**20) as recorder:
-        os.kill(recorder._process.pid, signal.SIGSTOP)
+        suspend(recorder._process.pid)
         for k in range(1000):
             recorder.add_images(frames(k, 1))
         dropped = recorder.dropped["us"]
@@ -304,7 +309,7 @@ def test_what_finds_no_room_is_dropped_and_counted_but_no_image_is(tmp_path):
 
 def test_a_disk_that_does_not_answer_or_is_full_is_one_line(tmp_path):
     recorder = Recorder(tmp_path / "slow.h5", HEADER, patience_s=0.3)
-    os.kill(recorder._process.pid, signal.SIGSTOP)
+    suspend(recorder._process.pid)
     with pytest.raises(jaxcal.OutputError, match=r"took no data for 0\.3 s: check it"):
         recorder.sync()
     os.kill(recorder._process.pid, signal.SIGCONT)
@@ -359,7 +364,7 @@ def test_a_writer_that_takes_no_data_does_not_hold_the_end_up(tmp_path, monkeypa
     take(recorder, recording, 0)
     recorder._patience = 0.2
     monkeypatch.setattr("hw.recording.recorder._ENDING_S", 0.2)
-    os.kill(recorder._process.pid, signal.SIGSTOP)
+    suspend(recorder._process.pid)
     for k in range(400):
         recorder.add_images(frames(k, 1))
     assert recorder.dropped["us"]
@@ -380,12 +385,58 @@ def test_a_writer_that_takes_no_data_does_not_hold_the_end_up(tmp_path, monkeypa
         assert again.rows["calibration"] == 1
 
 
+@contextmanager
+def slowed(recorder: Recorder) -> Iterator[None]:
+    """Stop the writer for a while whenever it has taken or told something."""
+    done, writer = threading.Event(), recorder._process.pid
+
+    def slow() -> None:
+        # Once the recording is finished, the writer ends.
+        with suppress(ProcessLookupError, ChildProcessError):
+            while not done.is_set():
+                suspend(writer)
+                done.wait(0.15)
+                before = recorder._taken
+                os.kill(writer, signal.SIGCONT)
+                while recorder._taken == before and not done.wait(0.001):
+                    pass
+
+    slowing = threading.Thread(target=slow)
+    slowing.start()
+    try:
+        yield
+    finally:
+        done.set()
+        slowing.join()
+
+
+@pytest.mark.real_time
+def test_a_slow_disk_is_waited_for_while_it_takes_data(tmp_path):
+    """It was told to have taken nothing, and the end of a long file was as late."""
+    path, recording = Path(tempfile.mkdtemp(dir=tmp_path)) / "rec.h5", simulated()
+    image = SimpleNamespace(**{**vars(frames(0, 1)[0]), "array": np.zeros((2048, 2048), np.uint8)})
+    with Recorder(path, HEADER) as recorder:
+        suspend(recorder._process.pid)
+        recorder.add_images([image] * 4)
+        recorder._patience = 0.5
+        for wait in (partial(take, recorder, recording, 0), recorder.finish):
+            began = time.monotonic()
+            with slowed(recorder):
+                wait()
+            assert time.monotonic() - began > 0.5
+    with h5py.File(path) as file:
+        assert (len(file["us/frames"]), len(file["calibration/pose"])) == (4, 1)
+    digest, _ = (path.parent / "rec.h5.sha256").read_text().split()
+    with path.open("rb") as file:
+        assert hashlib.file_digest(file, "sha256").hexdigest() == digest
+
+
 def test_a_disk_that_hangs_is_given_up_once(tmp_path, monkeypatch):
     """Each event waited anew, the end as well; then the writer was blamed, and not the disk."""
     recorder = Recorder(tmp_path / "rec.h5", HEADER, queue_bytes=2**16, patience_s=0.3)
     for name in ("_ENDING_S", "_HUNG_ENDING_S"):
         monkeypatch.setattr(f"hw.recording.recorder.{name}", 0.1)
-    os.kill(recorder._process.pid, signal.SIGSTOP)
+    suspend(recorder._process.pid)
     large = [SimpleNamespace(**{**vars(frames(0, 1)[0]), "array": np.zeros((512, 512), np.uint8)})]
     recorder.add_images(large * 8)
     began = time.monotonic()

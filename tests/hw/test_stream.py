@@ -28,6 +28,7 @@ from hw.runtime.errors import LostError, RefusedError, StaleError
 from hw.runtime.rigid import ur_to_pose
 
 
+@pytest.mark.real_time
 @pytest.mark.parametrize("seconds", [1.5, pytest.param(60.0, marks=pytest.mark.slow)])
 def test_no_pose_is_lost_at_500_and_125_hz_at_once(seconds):
     with (
@@ -61,6 +62,7 @@ def again_and_again(
         time.sleep(0.002)
 
 
+@pytest.mark.real_time
 def test_identity_and_tcp_offset():
     with EmulatedRobot() as robot, PoseStream(robot.host, clock=robot.clock) as poses:
         identity = poses.identity()
@@ -122,6 +124,7 @@ def test_payload_and_speed_slider_are_told():
         assert poses.pendant.changed(poses.pendant) == ""
 
 
+@pytest.mark.real_time
 def test_a_mute_controller_makes_poses_stale_and_then_lost():
     with EmulatedRobot() as robot:
         with PoseStream(robot.host, clock=robot.clock, timeout_s=2.0) as poses:
@@ -146,6 +149,7 @@ def test_a_mute_controller_makes_poses_stale_and_then_lost():
         assert time.monotonic() - start < 120.0
 
 
+@pytest.mark.real_time
 def test_a_dropped_connection_is_lost_at_once():
     with EmulatedRobot() as robot, PoseStream(robot.host, clock=robot.clock) as poses:
         robot.ask("drop")
@@ -158,6 +162,7 @@ def test_nobody_there():
         PoseStream("127.250.250.1", timeout_s=0.5).start()
 
 
+@pytest.mark.real_time
 def test_averages_of_steady_poses():
     with EmulatedRobot() as robot, PoseStream(robot.host, clock=robot.clock) as poses:
         poses.drain()
@@ -265,6 +270,7 @@ def delaying(host: str, port: int, seconds: Callable[[bytes], float]) -> Iterato
         listener.shutdown(socket.SHUT_RDWR)
 
 
+@pytest.mark.real_time
 def test_poses_that_come_late_are_not_new():
     delay = [0.15]
 
@@ -292,6 +298,7 @@ def test_poses_that_come_late_are_not_new():
                 assert min(sample.lag_s for sample in slow.drain()) > 0.04
 
 
+@pytest.mark.real_time
 def test_one_slow_start_does_not_make_every_later_pose_look_old():
     starts = []
 

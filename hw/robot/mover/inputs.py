@@ -12,7 +12,7 @@ import select
 from collections import deque
 from dataclasses import dataclass
 
-from hw.robot.mover.messages import Caller
+from hw.robot.mover.messages import WATCHDOG, Caller
 from hw.robot.rtde import Packet, PacketReader, PendantSettings
 from hw.robot.stream import PoseSample, offset_changed
 from hw.runtime.clock import Clock, Lag
@@ -179,5 +179,4 @@ class Inputs:
 
 def lost(what: str) -> LostError:
     """The error of a connection or a program that is gone."""
-    reason = "; the robot's own watchdog stops it. Motion needs a new confirmation"
-    return LostError(what + reason, device="robot")
+    return LostError(f"{what}; {WATCHDOG}", device="robot")

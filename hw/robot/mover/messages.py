@@ -29,6 +29,9 @@ from hw.runtime.errors import DeviceError, LostError, RefusedError, StaleError, 
 
 _KINDS = {kind.__name__: kind for kind in (LostError, RefusedError, StaleError, StoppedError)}
 
+WATCHDOG = "the robot's own watchdog stops it. Motion needs a new confirmation"
+"""What follows where nobody can command the robot any more."""
+
 
 @dataclass(frozen=True)
 class Setup:
