@@ -41,8 +41,9 @@ def compare(
 
     Each CAL is a calibration.json of "jaxcal calibrate --out", or any other file that "jaxcal
     export" writes. They must be of the same probe and marker, from different recordings. The status
-    is 5 if two of them are farther apart than 95 % of such pairs would be by their covariances. If
-    the verdict of one expects larger errors than its covariance says, the factor is told.
+    is 5 if two of them are farther apart than 95 % of such pairs would be by their covariances; few
+    images, which leave the size of the errors uncertain, are allowed for. If the verdict of one
+    expects larger errors than its covariance says, the factor is told.
     """
     import numpy as np
 

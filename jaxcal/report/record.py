@@ -49,6 +49,10 @@ CONVENTION = {
     "mm, then omega in rad, along and about the image's axes",
     "image_covariance": "of image_unknowns: those of covariance, and the logarithms of estimated "
     "pixel sizes and sound speed, and the delay in mm",
+    "degrees_of_freedom": "of Student's distribution of the errors, with covariance as its "
+    "scale; null where the SDs were given",
+    "variance_factor": "mean square errors over what covariance says: Student's variance where the "
+    "SDs that were tuned to the images are their weights, else 1; apply and tre include it",
     "further_unknowns": "every unknown that was estimated beside X and the target: values "
     "(factors on the nominal ones where a tangent is log_..., else in the tangent's unit), SDs and "
     "prior SDs of the tangents; prior_sd is null without a prior",
@@ -135,6 +139,8 @@ def calibration_record(
         "covariance": transform.covariance,
         "image_unknowns": tangent_names(transform.unknowns),
         "image_covariance": transform.image_covariance,
+        "degrees_of_freedom": transform.degrees_of_freedom,
+        "variance_factor": transform.variance_factor,
         "point_covariance_mm2": answer.point_covariance if known else None,
         "observability": result.observability,
         "rms_mm": answer.rms,
