@@ -180,8 +180,10 @@ def _summary(found: list[Comparison]) -> str:
     largest = f"The two that differ most put the image {worst:.2f} mm apart (RMS)"
     if not known:
         return f"{largest}. How far apart they should be is not known: no covariances."
+    from jaxcal.diagnostics.intervals import LEVEL
+
     apart = sum(not each.agree for each in known)
     return (
         f"{largest}. {apart} of {len(known)} pairs are farther apart than 95 % of such pairs would "
-        f"be by their covariances; about {0.05 * len(known):.1f} are expected by chance."
+        f"be by their covariances; about {(1 - LEVEL) * len(known):.1f} are expected by chance."
     )
