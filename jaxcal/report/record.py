@@ -63,7 +63,7 @@ CONVENTION = {
     "covariance has them, larger by factor where the data contradict it; null where the "
     "calibration is not to be used",
     "objective": "the minimised sum of squares: mm^2, or in SDs with the gaussian prior; with auto "
-    "and uniform that of the Gaussian fit before the laws are weighed",
+    "and uniform that of the Gaussian fit before the distributions are weighed",
     "certified": "no transform fits Eq. 7 better (one part in 1e9), which is proved: of the answer "
     "for the conventional method, of the conventional fit of the same images for the others; "
     "Eq. 7's minimum is at most gap_mm2 lower; null where no proof is tried",
@@ -75,8 +75,8 @@ CONVENTION = {
     "elevational, axial; null where it is not used",
     "date": "when the calibration was written: ISO 8601, UTC; not in the record of a calibration "
     "in memory",
-    "offset_law": "which law the elevational offsets follow and with what probability, their mean, "
-    "and which noise model is in use; null where no laws were weighed",
+    "offset_law": "which distribution the elevational offsets follow, with what probability, their "
+    "mean, and which noise model is in use; null where no distributions were weighed",
 }
 
 
