@@ -77,6 +77,28 @@ def record(result, recording):
     return calibration_record(result, recording)
 
 
+def test_a_saved_calibration_knows_how_certain_its_sds_are(result, tmp_path):
+    """Also where SDs that were tuned are the weights: ``apply`` agrees with the predicted TRE."""
+    pixels = POINTS / np.asarray(result.scale_mm_per_px)
+    tuned = replace(result, prior="gaussian", sigma_tuned=np.asarray(True))
+    given = replace(tuned, sigma_tuned=np.asarray(False))
+    left = float(result.images_used) - 11 / 3
+    for answer, freedom, factor in (
+        (result, left, 1.0), (tuned, left, left / (left - 2)), (given, None, 1.0)
+    ):  # fmt: skip
+        answer.image_transform().save(tmp_path / "cal.json")
+        stored = load_calibration(tmp_path / "cal.json")
+        assert stored.degrees_of_freedom == freedom
+        assert stored.variance_factor == pytest.approx(factor, rel=1e-15)
+        sd = np.sqrt(np.trace(stored.apply(pixels).covariance, axis1=1, axis2=2))
+        np.testing.assert_allclose(sd, jaxcal.predicted_tre(answer, POINTS), rtol=1e-9)
+        record = json.loads((tmp_path / "cal.json").read_text())
+        del record["degrees_of_freedom"], record["variance_factor"]
+        (tmp_path / "cal.json").write_text(json.dumps(record))
+        older = load_calibration(tmp_path / "cal.json")
+        assert (older.degrees_of_freedom, older.variance_factor) == (None, 1.0)
+
+
 @pytest.mark.parametrize(
     ("variances", "freedom"),
     [([1.0, 1.0, 1.0], np.inf), ([1.0, 0.2, 0.01], 9.0), ([4.0, 1.0, 0.3, 0.1, 0.05, 0.01], 20.0)],

@@ -8,12 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import stats
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 import jaxcal
 from jaxcal import ImageTransform, InputError, compare_calibrations
 from jaxcal.cli.main import main
+from jaxcal.diagnostics.comparison import Comparison
 from jaxcal.runtime.arrays import map_arrays
 
 POINTS = np.array([[100.0, 300.0], [10, 10], [390, 10], [10, 490], [390, 490]])
@@ -105,6 +107,36 @@ def test_nineteen_of_twenty_pairs_with_right_covariances_agree():
     expected = found.expected_mm
     np.testing.assert_allclose(np.sqrt(np.mean(apart**2, axis=0)), expected, rtol=0.05)
     assert found.expected_rms_mm == pytest.approx(np.sqrt(np.mean(expected**2)))
+
+
+def test_sds_estimated_from_few_images_widen_the_limit():
+    """For shifts alike along all axes: the distance squared is 3 s^2 F(3, n) with Student's n."""
+    s, n = 0.2, 5.0
+    exact = ImageTransform(place(), SCALE, covariance=np.zeros((6, 6)))
+    given = replace(exact, covariance=np.diag([s, s, s, 0, 0, 0]) ** 2)
+    fitted = replace(given, degrees_of_freedom=n)
+    tuned = replace(fitted, variance_factor=n / (n - 2))
+
+    def limit(square: float, freedom: float) -> float:
+        return np.sqrt(3 * square * stats.f.ppf(0.95, 3, freedom))
+
+    def found(first: ImageTransform, second: ImageTransform) -> Comparison:
+        return compare_calibrations(first, second, POINTS)
+
+    for one in (fitted, tuned):
+        for pair in ((one, exact), (exact, one)):
+            assert found(*pair).limit_mm == pytest.approx(limit(s**2, n), rel=5e-3)
+    assert found(fitted, fitted).limit_mm == pytest.approx(limit(2 * s**2, 2 * n), rel=5e-3)
+    # The vector with 10 degrees of freedom has the covariance of the two with 5.
+    same = 2 * s**2 * tuned.variance_factor / (10 / 8)
+    assert found(tuned, tuned).limit_mm == pytest.approx(limit(same, 2 * n), rel=5e-3)
+    expected = [found(each, each).expected_rms_mm for each in (given, fitted, tuned)]
+    assert expected == pytest.approx(np.sqrt([6.0, 6.0, 10.0]) * s)
+    # Beside one that is known three times as well, the other's degrees of freedom count.
+    better = replace(tuned, covariance=tuned.covariance / 9)
+    left = (1 + 1 / 9) ** 2 / (1 / n + 1 / 81 / n)
+    square = (1 + 1 / 9) * s**2 * (5 / 3) / (left / (left - 2))
+    assert found(tuned, better).limit_mm == pytest.approx(limit(square, left), rel=5e-3)
 
 
 def test_what_cannot_be_compared_is_refused():

@@ -74,7 +74,9 @@ def test_plus_matrix_is_jaxcals_model(seed):
     "extension", ["json", "xml", "tfm", "txt", "h5", "yaml", "csv", "npy", "npz"]
 )
 def test_saved_and_loaded(tmp_path, extension):
-    known = replace(random_transform(), tre_factor=1.5)
+    known = replace(
+        random_transform(), tre_factor=1.5, degrees_of_freedom=5.0, variance_factor=1.25
+    )
     path = tmp_path / f"cal.{extension}"
     known.save(path)
     if extension == "xml":
@@ -91,6 +93,7 @@ def test_saved_and_loaded(tmp_path, extension):
     if extension in ("json", "npz"):
         np.testing.assert_array_equal(found.covariance, known.covariance)
         assert (found.face_offset_mm, found.tre_factor) == (1.5, 1.5)
+        assert (found.degrees_of_freedom, found.variance_factor) == (5.0, 1.25)
     if extension == "json":
         assert (found.error_mm, found.converged) == (0.7, True)
     if extension == "xml":
@@ -559,6 +562,8 @@ def good_record():
         ({"scale_mm_per_px": [np.nan, np.nan]}, "scale_mm_per_px holds NaN or Inf"),
         ({"range_factor": np.inf}, "range_factor holds NaN or Inf"),
         ({"tre": {"factor": 0}}, "tre_factor must be positive"),
+        ({"degrees_of_freedom": 0}, "degrees_of_freedom must be at least 1"),
+        ({"variance_factor": 0.5}, "variance_factor must be at least 1"),
         ({"tre": {"factor": "x"}}, "factor must be numbers"),
         ({"converged": "false"}, "converged must be true, false or null"),
         ({"converged": 0}, "converged must be true, false or null"),

@@ -19,11 +19,9 @@ from hw.runtime.clock import REAL
 from hw.runtime.errors import DeviceError
 from jaxcal import CalibrationError, InputError
 from jaxcal.data.recording import MINIMUM_IMAGES, MetresError, check_pose_units
-from jaxcal.io.untrusted import UpTo
+from jaxcal.io.hdf5 import IMAGES
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.messages import command_line
-
-_IMAGES = UpTo(100_000, "images")
 
 
 class KeptImages:
@@ -163,9 +161,9 @@ def read_images(
     RecordingWriter.resume(path).close()
     wanted = {"pose": (4, 4), **(shapes or {})}
     with opened(path) as root:
-        mask = read_column(root, "calibration", "mask", (_IMAGES,), "b")
+        mask = read_column(root, "calibration", "mask", (IMAGES,), "b")
         columns = {
-            name: read_column(root, "calibration", name, (_IMAGES, *shape), "f")
+            name: read_column(root, "calibration", name, (IMAGES, *shape), "f")
             for name, shape in wanted.items()
         }
     rows = min(map(len, [mask, *columns.values()]))

@@ -23,6 +23,7 @@ from hw.recording.layout import (
 from jaxcal import FormatError, InputError
 from jaxcal.data.poses import check_poses
 from jaxcal.io.given_files import check_readable, naming
+from jaxcal.io.hdf5 import ELEMENTS, IMAGES
 from jaxcal.io.lines import HDF5_BEGINNING
 from jaxcal.io.untrusted import (
     Node,
@@ -125,13 +126,12 @@ def read_progress(path: str | os.PathLike[str]) -> Progress:
         FormatError: not such a file; one line that starts with the path.
     """
     with opened(path) as root:
-        images = UpTo(100_000, "images")
-        taken = read_column(root, "calibration", "target", (images,), "i")
+        taken = read_column(root, "calibration", "target", (IMAGES,), "i")
         last = [0.0]
         for name in ("tracker", "ae", "events"):
             times = read_column(root, name, "t_host", (UpTo(2**27, "rows"),))
             last.append(float(np.nanmax(times, initial=0.0)))
-        targets = read_column(root, "plan", "targets", (images, 4, 4))
+        targets = read_column(root, "plan", "targets", (IMAGES, 4, 4))
         # Checked but not changed in any digit: the plan's digest must be the same again.
         try:
             check_poses(targets)
@@ -142,11 +142,11 @@ def read_progress(path: str | os.PathLike[str]) -> Progress:
         return Progress(
             settings=_settings(root),
             targets=targets,
-            poses=read_column(root, "calibration", "pose", (images, 4, 4)),
-            measurements=_measurements(root, images),
-            max_elevation=read_column(root, "calibration", "max_elevation", (images,)),
+            poses=read_column(root, "calibration", "pose", (IMAGES, 4, 4)),
+            measurements=_measurements(root),
+            max_elevation=read_column(root, "calibration", "max_elevation", (IMAGES,)),
             taken=taken,
-            true_elevation=read_column(root, "placement", "true_elevation", (images,)),
+            true_elevation=read_column(root, "placement", "true_elevation", (IMAGES,)),
             last_s=max(last),
             probe=_probe(root),
             electronics=_electronics(root),
@@ -220,12 +220,12 @@ def _settings(root: Node) -> dict[str, object]:
     return found
 
 
-def _measurements(root: Node, images: UpTo) -> np.ndarray:
+def _measurements(root: Node) -> np.ndarray:
     """Points where the recording has them, else times of flight."""
     node = group(root, "calibration")
     if node is not None and child(node, "point") is not None:
-        return read_column(root, "calibration", "point", (images, 2))
-    return read_column(root, "calibration", "time_of_flight", (images, UpTo(4096, "elements")))
+        return read_column(root, "calibration", "point", (IMAGES, 2))
+    return read_column(root, "calibration", "time_of_flight", (IMAGES, ELEMENTS))
 
 
 def read_column(

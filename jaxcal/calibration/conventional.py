@@ -13,6 +13,7 @@ derivatives, as the diagnostics are.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 
@@ -28,8 +29,9 @@ from jaxcal.diagnostics.uncertainty import (
     variances_by_axis,
 )
 from jaxcal.model.thresholds import STATIONARY
-from jaxcal.model.unknowns import FURTHER, count_unknowns, split_further
+from jaxcal.model.unknowns import FURTHER, Blocks, count_unknowns, split_further
 from jaxcal.result.calibration import Calibration, Linearisation, Medium, Status
+from jaxcal.runtime.array_types import Float, Num
 from jaxcal.runtime.arrays import map_arrays
 from jaxcal.solvers.closed_form.reduced_objective import CONSTRAINTS
 from jaxcal.solvers.closed_form.single import ClosedForm, solve_problem
@@ -61,7 +63,7 @@ def closed_form_answer(problem: Problem, plan: SolvePlan) -> Calibration | None:
 
 def _with_uncertainty(found: ClosedForm, problem: Problem, plan: SolvePlan) -> Calibration | None:
     """The closed form as a calibration without its problem; None where poses are degenerate."""
-    blocks, eps = plan.blocks, float(np.finfo(float).eps)
+    blocks = plan.blocks
     seen = ImageErrors.of_closed_form(found, problem, blocks)
     plane = np.zeros_like(seen.mask)
     residual, axial = seen.from_circle(plane)
@@ -70,23 +72,16 @@ def _with_uncertainty(found: ClosedForm, problem: Problem, plan: SolvePlan) -> C
     design = rows.T @ rows
     used, lever = np.asarray(seen.mask.sum()), np.asarray(seen.lever(seen.mask)[0])
     objective = float(errors @ errors)
-    variance = objective / max(3 * used - count_unknowns(blocks), 1.0)
-
-    # As in jaxcal.calibration.answer: which directions are known, in mm at the target.
-    scale = mm_at_target(lever, blocks)
-    values = np.linalg.eigvalsh(design / np.outer(scale, scale))
-    if values[0] <= threshold(eps) * values.sum():
+    variance = float(objective / max(3 * used - count_unknowns(blocks), 1.0))
+    observability = _observability(design, variance, lever, blocks)
+    if observability == "degenerate":
         return None
-    least = variance / (LARGEST_SD * lever) ** 2
-    weak = values[0] <= least and eps * values.sum() < least
+    weak = observability == "weak"
     status = Status.UNOBSERVABLE if weak else Status.CONVERGED
     covariance, information = np.full_like(design, np.nan), design
     if not weak:
-        parts, squares = np.einsum("mkp,mkq->kpq", each, each), np.sum(residual[0] ** 2, axis=0)
-        inverse = inverses(design[None], eps)[0]
-        variances = variances_by_axis(parts, squares, used, inverse, lever)
-        relative = covariance_by_axis(parts, variances, inverse)
-        covariance, information = variance * relative, inverses(relative[None], eps)[0]
+        relative, information = _relative_covariance(each, residual[0], design, used, lever)
+        covariance = variance * relative
 
     values = [seen.unknowns.further[name] for name in FURTHER if name in blocks]
     further = np.array([component[0] for value in values for component in value])
@@ -145,3 +140,35 @@ def _with_uncertainty(found: ClosedForm, problem: Problem, plan: SolvePlan) -> C
         blocks=blocks,
         robust=False,
     )
+
+
+def _observability(
+    design: Float[np.ndarray, "p p"],
+    variance: float,
+    lever: Float[np.ndarray, ""],
+    blocks: Blocks,
+) -> Literal["degenerate", "weak", "known"]:
+    """Which directions are known, in mm at the target, as in :mod:`jaxcal.calibration.answer`."""
+    eps = float(np.finfo(float).eps)
+    scale = mm_at_target(lever, blocks)
+    values = np.linalg.eigvalsh(design / np.outer(scale, scale))
+    if values[0] <= threshold(eps) * values.sum():
+        return "degenerate"
+    least = variance / (LARGEST_SD * lever) ** 2
+    return "weak" if values[0] <= least and eps * values.sum() < least else "known"
+
+
+def _relative_covariance(
+    rows: Float[np.ndarray, "n 3 p"],
+    residual: Float[np.ndarray, "n 3"],
+    design: Float[np.ndarray, "p p"],
+    used: Num[np.ndarray, ""],
+    lever: Float[np.ndarray, ""],
+) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "p p"]]:
+    """Covariance for residuals of variance 1, with a variance for each axis, and its inverse."""
+    eps = float(np.finfo(float).eps)
+    parts, squares = np.einsum("mkp,mkq->kpq", rows, rows), np.sum(residual**2, axis=0)
+    inverse = inverses(design[None], eps)[0]
+    variances = variances_by_axis(parts, squares, used, inverse, lever)
+    relative = covariance_by_axis(parts, variances, inverse)
+    return relative, inverses(relative[None], eps)[0]

@@ -54,12 +54,11 @@ def apply(
 
     SOURCE is a table with columns u and v, and a pose (probe to tracker) if points in the tracker's
     frame are wanted; or a recording (.h5). Standard deviations and covariances include those of the
-    calibration (with estimated pixel sizes) and of --pixel-sd, but not those of the pose. They are
-    what the calibration's covariance says. Where the noise was estimated from few images, the TRE
-    of its report is larger, by the factor of Student's t (1.13 with 12 images). If its verdict
-    expects larger errors still, that factor is told on standard error. Masked images of a recording
-    are left out; a last column, image, has the numbers of the others. With --skip-invalid a last
-    column, line, says which row is which.
+    calibration (with estimated pixel sizes) and of --pixel-sd, but not those of the pose. Those of
+    the calibration are what its covariance says, times the factor for few images that the TRE of
+    its report has, too (variance_factor). If its verdict expects larger errors still, that factor
+    is told on standard error. Masked images of a recording are left out; a last column, image, has
+    the numbers of the others. With --skip-invalid a last column, line, says which row is which.
     """
     import numpy as np
 

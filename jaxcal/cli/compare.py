@@ -41,8 +41,9 @@ def compare(
 
     Each CAL is a calibration.json of "jaxcal calibrate --out", or any other file that "jaxcal
     export" writes. They must be of the same probe and marker, from different recordings. The status
-    is 5 if two of them are farther apart than 95 % of such pairs would be by their covariances. If
-    the verdict of one expects larger errors than its covariance says, the factor is told.
+    is 5 if two of them are farther apart than 95 % of such pairs would be by their covariances; few
+    images, which leave the size of the errors uncertain, are allowed for. If the verdict of one
+    expects larger errors than its covariance says, the factor is told.
     """
     import numpy as np
 
@@ -179,8 +180,10 @@ def _summary(found: list[Comparison]) -> str:
     largest = f"The two that differ most put the image {worst:.2f} mm apart (RMS)"
     if not known:
         return f"{largest}. How far apart they should be is not known: no covariances."
+    from jaxcal.diagnostics.intervals import LEVEL
+
     apart = sum(not each.agree for each in known)
     return (
         f"{largest}. {apart} of {len(known)} pairs are farther apart than 95 % of such pairs would "
-        f"be by their covariances; about {0.05 * len(known):.1f} are expected by chance."
+        f"be by their covariances; about {(1 - LEVEL) * len(known):.1f} are expected by chance."
     )

@@ -183,10 +183,6 @@ class CurvilinearProbe(_Array):
         """Half the angle that the aperture covers, rad."""
         return 0.5 * self.width_mm / self.radius_mm
 
-    def element_angle(self) -> Float[np.ndarray, " elements"]:
-        """Angle of every element about the arc's centre, rad from the axis."""
-        return self.polar(self.element_positions())[0]
-
     def polar(
         self, points: Num[np.ndarray, "*batch d"]
     ) -> tuple[Float[np.ndarray, "*batch"], Float[np.ndarray, "*batch"]]:

@@ -30,6 +30,9 @@ from jaxcal.runtime.messages import counted, shown
 MINIMUM_IMAGES = 4
 """With fewer used images nothing can be solved: 3 residuals an image against 9 unknowns."""
 
+MOST_IMAGES = 100_000
+"""Most images that a recording file may hold, and that are simulated."""
+
 LARGEST = 1e7
 """Largest coordinate accepted, in mm or px, and largest variance of one: ten kilometres."""
 

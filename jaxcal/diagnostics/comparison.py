@@ -6,11 +6,20 @@ the derivatives D of a point by the unknowns, the two places are
     D_1 d_1 - D_2 d_2
 
 apart if both estimate the same transform. The root mean square of this over the points is the
-length of a normal vector, whose quantiles :mod:`jaxcal.diagnostics.intervals` computes.
+length of a vector, whose quantiles :mod:`jaxcal.diagnostics.intervals` computes: normal if all SDs
+were given. SDs estimated from the images make d_1 and d_2 Student's, with n_1 and n_2 degrees of
+freedom, and then the vector is taken for Student's, with the degrees of freedom
+
+    n = (v_1 + v_2)^2 / (v_1^2 / n_1 + v_2^2 / n_2),
+
+where v_1 and v_2 are the two mean squares (Welch 1947, Satterthwaite 1946). n is larger than n_1,
+so Student's variance is smaller for n than for n_1; where the mean square of d_1 has this factor
+(``variance_factor``), the vector's covariance makes up for the difference.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from math import inf
 
@@ -18,7 +27,7 @@ import numpy as np
 
 from jaxcal import InputError
 from jaxcal.data.poses import rotation_angle
-from jaxcal.diagnostics.intervals import LEVEL, length_quantile
+from jaxcal.diagnostics.intervals import LEVEL, length_quantile, student_variance
 from jaxcal.result.calibration import Calibration
 from jaxcal.result.transform import ImageTransform
 from jaxcal.runtime.array_types import Float
@@ -36,7 +45,8 @@ class Comparison:
     Attributes:
         points: (m, 2) image points, px, or [lateral, range] in mm where there are no pixels.
         apart_mm: (m,) how far apart the two calibrations put each point, mm.
-        expected_mm: (m,) its root mean square by both covariances, mm; NaN where one is not known.
+        expected_mm: (m,) its root mean square by both covariances (and ``variance_factor``), mm;
+            NaN where one is not known.
         rms_mm: root mean square of ``apart_mm``, mm.
         expected_rms_mm: the same of ``expected_mm``, mm.
         limit_mm: by both covariances, 95 % of such pairs have a smaller ``rms_mm``, mm.
@@ -97,13 +107,7 @@ def compare_calibrations(
     variances = np.trace(one.covariance + other.covariance, axis1=1, axis2=2)
     limit = np.nan
     if np.isfinite(variances).all():
-        # The root mean square is the length of this matrix times standard normals.
-        factors = [each.error_factor(points) for each in (first, second)]
-        factor = np.concatenate([each.reshape(-1, each.shape[-1]) for each in factors], axis=1)
-        spread = np.linalg.eigvalsh(factor.T @ factor / len(points))
-        # Both move the points alike, so that half of these directions do nothing.
-        spread = spread[spread >= _LEAST_SHARE * spread.sum()]
-        limit = length_quantile(spread[None], inf, LEVEL)[0]
+        limit = _limit(first, second, points)
     return Comparison(
         points=points,
         apart_mm=apart,
@@ -115,6 +119,40 @@ def compare_calibrations(
             np.degrees(rotation_angle(first.image_plane_to_probe, second.image_plane_to_probe))
         ),
     )
+
+
+def _limit(
+    first: ImageTransform, second: ImageTransform, points: Float[np.ndarray, "m 2"]
+) -> float:
+    """The quantile :data:`~jaxcal.diagnostics.intervals.LEVEL` of the points' RMS distance, mm."""
+    both = (first, second)
+    factors = [each.error_factor(points).reshape(3 * len(points), -1) for each in both]
+    squares = np.array(
+        [
+            each.variance_factor * np.sum(factor**2)
+            for each, factor in zip(both, factors, strict=True)
+        ]
+    )
+    left = _combined_freedom(squares, [each.degrees_of_freedom or inf for each in both])
+    student = float(student_variance(np.array(left)))
+    # The root mean square is the length of this matrix times Student's vector.
+    factor = np.concatenate(
+        [
+            math.sqrt(max(1.0, each.variance_factor / student)) * factor
+            for each, factor in zip(both, factors, strict=True)
+        ],
+        axis=1,
+    )
+    spread = np.linalg.eigvalsh(factor.T @ factor / len(points))
+    # Both move the points alike, so that half of these directions do nothing.
+    spread = spread[spread >= _LEAST_SHARE * spread.sum()]
+    return float(length_quantile(spread[None], left, LEVEL)[0])
+
+
+def _combined_freedom(squares: Float[np.ndarray, " 2"], freedom: list[float]) -> float:
+    """Degrees of freedom of a difference, from both mean squares and theirs (Welch)."""
+    uncertain = np.sum(squares**2 / freedom)
+    return float(np.sum(squares) ** 2 / uncertain) if uncertain > 0 else inf
 
 
 def _transform(name: str, given: object) -> ImageTransform:

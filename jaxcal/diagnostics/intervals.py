@@ -25,7 +25,7 @@ Kackar and Harville 1984 (estimated weights).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any
 
 import numpy as np
@@ -189,8 +189,7 @@ def predicted_tre(
 
     Estimated pixel sizes, sound speed and delay are included, with their correlation with X. Where
     SDs were tuned to the images (priors auto, uniform and gaussian), the mean square is larger than
-    the covariance's trace (that of :meth:`ImageTransform.apply`, say), by the variance of Student's
-    t: with 12 images by a factor of 9/7.
+    the covariance's trace, by the variance of Student's t: with 12 images by a factor of 9/7.
 
     Args:
         calibration: one or a batch.
@@ -411,7 +410,7 @@ class _Radial:
         return values.mean(axis=1), rise.mean(axis=1) / _SPACING
 
 
-@cache
+@lru_cache(maxsize=64)
 def _radial(dimensions: int, freedom: float) -> _Radial:
     """The distribution of rho^2."""
     square = np.exp(np.linspace(_FIRST, _LAST, _RADII))

@@ -35,7 +35,7 @@ from jaxcal.diagnostics.image_errors import (
 )
 from jaxcal.diagnostics.sd_by_place import relative_sd
 from jaxcal.diagnostics.uncertainty import Uncertainty, inverses
-from jaxcal.model.outlying import robust_sd, stands_out, studentise
+from jaxcal.model.outlying import LEAST_LEFT, robust_sd, stands_out, studentise
 from jaxcal.model.thresholds import FEWEST_IMAGES
 from jaxcal.model.unknowns import block_slice, further_derivatives, measured
 from jaxcal.result.calibration import Calibration
@@ -85,7 +85,7 @@ def inspect(
     residual = seen.errors
     if tuned:
         whitened = Whitened.of(answer, shifted)
-        left = np.maximum(1 - whitened.leverage(uncertainty.inverse), 0.05)
+        left = np.maximum(1 - whitened.leverage(uncertainty.inverse), LEAST_LEFT)
         residual = whitened.errors / np.sqrt(left)
     kurtosis, misfit = check_noise_model(residual, seen.distance, kept)
     gain = gains(answer, seen, uncertainty)

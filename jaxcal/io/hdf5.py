@@ -37,6 +37,7 @@ from jaxcal.data.poses import check_poses
 from jaxcal.data.probe import CurvilinearProbe, LinearProbe, Probe
 from jaxcal.data.recording import (
     MINIMUM_IMAGES,
+    MOST_IMAGES,
     UNIT_OF,
     Images,
     Kind,
@@ -68,8 +69,9 @@ if TYPE_CHECKING:
 
 FORMAT = "jaxcal-recording"
 VERSION = 1
-IMAGES = UpTo(100_000, "images")
+IMAGES = UpTo(MOST_IMAGES, "images")
 ELEMENTS = UpTo(4096, "elements")
+"""Largest sizes of a recording, also of one that an acquisition resumes."""
 GROUPS = ("probe", "calibration", "test", "truth", "segmentation")
 """All that :func:`save` writes."""
 

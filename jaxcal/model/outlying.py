@@ -12,15 +12,18 @@ CUT = 6.0
 FEW_IMAGES = 30
 """With fewer images in use, n, the limit is wider by sqrt(30 / n): 9.5 SDs for a dozen."""
 
-RELATIVE_FLOOR = 0.02
+GROSS_SHARE = 0.02
 """No component's SD is taken to be less than this share of the largest: smaller errors are no
 gross ones."""
+
+LEAST_LEFT = 0.05
+"""Least share of an image's error that a fit is taken to leave in its residual (1 - leverage)."""
 
 
 def with_floor(sigma: Float[AnyArray, "*batch 3"]) -> Float[HeldArray, "*batch 3"]:
     """The components' SDs, mm, none below its floor."""
     xp = array_module(sigma)
-    return xp.maximum(sigma, xp.maximum(RELATIVE_FLOOR * xp.max(sigma, -1, keepdims=True), 1e-6))
+    return xp.maximum(sigma, xp.maximum(GROSS_SHARE * xp.max(sigma, -1, keepdims=True), 1e-6))
 
 
 def robust_sd(
@@ -49,7 +52,7 @@ def studentise(
     An image in use pulls the fit towards itself; the fit predicts an image that is not in use.
     """
     xp = array_module(errors, leverage, sigma, kept)
-    left = xp.where(kept[..., None] > 0, xp.maximum(1 - leverage, 0.05), 1 + leverage)
+    left = xp.where(kept[..., None] > 0, xp.maximum(1 - leverage, LEAST_LEFT), 1 + leverage)
     return errors / xp.sqrt(left) / sigma[..., None, :]
 
 

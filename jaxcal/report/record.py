@@ -49,6 +49,10 @@ CONVENTION = {
     "mm, then omega in rad, along and about the image's axes",
     "image_covariance": "of image_unknowns: those of covariance, and the logarithms of estimated "
     "pixel sizes and sound speed, and the delay in mm",
+    "degrees_of_freedom": "of Student's distribution of the errors, with covariance as its "
+    "scale; null where the SDs were given",
+    "variance_factor": "mean square errors over what covariance says: Student's variance where the "
+    "SDs that were tuned to the images are their weights, else 1; apply and tre include it",
     "further_unknowns": "every unknown that was estimated beside X and the target: values "
     "(factors on the nominal ones where a tangent is log_..., else in the tangent's unit), SDs and "
     "prior SDs of the tangents; prior_sd is null without a prior",
@@ -59,7 +63,7 @@ CONVENTION = {
     "covariance has them, larger by factor where the data contradict it; null where the "
     "calibration is not to be used",
     "objective": "the minimised sum of squares: mm^2, or in SDs with the gaussian prior; with auto "
-    "and uniform that of the Gaussian fit before the laws are weighed",
+    "and uniform that of the Gaussian fit before the distributions are weighed",
     "certified": "no transform fits Eq. 7 better (one part in 1e9), which is proved: of the answer "
     "for the conventional method, of the conventional fit of the same images for the others; "
     "Eq. 7's minimum is at most gap_mm2 lower; null where no proof is tried",
@@ -71,8 +75,8 @@ CONVENTION = {
     "elevational, axial; null where it is not used",
     "date": "when the calibration was written: ISO 8601, UTC; not in the record of a calibration "
     "in memory",
-    "offset_law": "which law the elevational offsets follow and with what probability, their mean, "
-    "and which noise model is in use; null where no laws were weighed",
+    "offset_law": "which distribution the elevational offsets follow, with what probability, their "
+    "mean, and which noise model is in use; null where no distributions were weighed",
 }
 
 
@@ -135,6 +139,8 @@ def calibration_record(
         "covariance": transform.covariance,
         "image_unknowns": tangent_names(transform.unknowns),
         "image_covariance": transform.image_covariance,
+        "degrees_of_freedom": transform.degrees_of_freedom,
+        "variance_factor": transform.variance_factor,
         "point_covariance_mm2": answer.point_covariance if known else None,
         "observability": result.observability,
         "rms_mm": answer.rms,

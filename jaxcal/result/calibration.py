@@ -494,10 +494,15 @@ class Calibration:
             CalibrationError: under a JAX transformation.
             InputError: of a batch.
         """
-        from jaxcal.diagnostics.intervals import range_of_row_zero
+        from jaxcal.diagnostics.intervals import (
+            degrees_of_freedom,
+            range_of_row_zero,
+            variance_factor,
+        )
 
         answer = self.numpy()
         check_one(answer.status_code)
+        left = float(degrees_of_freedom(answer))
         scale = answer.scale_mm_per_px
         known = np.isfinite(answer.unknowns_covariance).all()
         origin, factor = range_of_row_zero(answer)
@@ -516,6 +521,8 @@ class Calibration:
                 np.asarray(answer.unknowns_covariance)[rows[:, None], rows] if known else None
             ),
             probe_frame=(self.pose_frames or ("Probe",))[0],
+            degrees_of_freedom=left if np.isfinite(left) else None,
+            variance_factor=float(variance_factor(answer)),
         )
 
     def plus_matrix(self) -> Float[np.ndarray, "4 4"]:

@@ -40,6 +40,8 @@ _NPZ = (
     "rms_mm",
     "converged",
     "date",
+    "degrees_of_freedom",
+    "variance_factor",
 )
 _ROUNDED = 1e-4
 """Relative difference of the columns of two matrices of a record that rounding explains."""
@@ -258,6 +260,8 @@ def _record(transform: ImageTransform) -> dict[str, Any]:
         "rms_mm": transform.error_mm,
         "tre": None if transform.tre_factor == 1 else {"factor": transform.tre_factor},
         "pose_frames": None if probe == "Probe" else {"from": probe, "to": None},
+        "degrees_of_freedom": transform.degrees_of_freedom,
+        "variance_factor": transform.variance_factor,
         "date": transform.date,
         "jaxcal_version": __version__,
     }
@@ -443,6 +447,8 @@ def transform_from_record(record: dict[str, Any], *, source: str = "memory") -> 
         "range_factor": _array(record, "range_factor", ()),
         "error_mm": _array(record, "rms_mm", ()),
         "tre_factor": _array(tre, "factor", ()),
+        "degrees_of_freedom": _array(record, "degrees_of_freedom", ()),
+        "variance_factor": _array(record, "variance_factor", ()),
         "covariance": _array(record, "covariance", (6, 6)),
         "image_covariance": _array(record, "image_covariance", (size, size)),
         "probe_frame": named if isinstance(named, str) else None,

@@ -80,13 +80,20 @@ class ImageTransform:
         date: when the calibration was made, ISO 8601 with its time zone; None if unknown.
         probe_frame: name of the probe's frame, for programs that name frames; ``Probe`` is written
             for a name that PLUS refuses.
-        tre_factor: how many times larger than the covariance says the calibration's verdict expects
-            the errors of image points to be; 1 where no verdict is known.
+        tre_factor: how many times larger than the covariance and ``variance_factor`` say the
+            calibration's verdict expects the errors of image points to be; 1 where no verdict is
+            known.
+        degrees_of_freedom: of the SDs behind the covariance, which were estimated from the same
+            images; None where the SDs were given, or where a file does not say.
+        variance_factor: how many times larger the mean square errors are than the covariance says,
+            because of these SDs (:func:`jaxcal.predicted_tre` includes it); 1 where that is
+            not known.
 
     Raises:
         InputError: wrong shapes, ``unknowns`` or ``date``; and, unless ``converged`` is False, NaN
-            or Inf, a matrix that is not rigid, sizes or a factor that are not positive, a
-            covariance that is not symmetric or has negative variances.
+            or Inf, a matrix that is not rigid, sizes or a ``range_factor`` or ``tre_factor`` that
+            are not positive, ``degrees_of_freedom`` or a ``variance_factor`` below 1, a covariance
+            that is not symmetric or has negative variances.
     """
 
     image_plane_to_probe: Float[np.ndarray, "4 4"]
@@ -102,6 +109,8 @@ class ImageTransform:
     date: str | None = None
     probe_frame: str = "Probe"
     tre_factor: float = 1.0
+    degrees_of_freedom: float | None = None
+    variance_factor: float = 1.0
 
     def __post_init__(self) -> None:
         moving = [name for name in TABLE if TABLE[name].in_image]
@@ -115,6 +124,8 @@ class ImageTransform:
             "face_offset_mm": (),
             "range_factor": (),
             "tre_factor": (),
+            "degrees_of_freedom": (),
+            "variance_factor": (),
             "covariance": (6, 6),
             "image_covariance": (size, size),
             "error_mm": (),
@@ -244,9 +255,9 @@ class ImageTransform:
 
         Returns:
             Points and covariances. The covariances include the calibration's (also that of
-            estimated pixel sizes, sound speed and delay) and the points' own, but not the pose's,
-            and neither the factor for tuned SDs that :func:`jaxcal.predicted_tre` has, nor the
-            verdict's (``tre_factor``).
+            estimated pixel sizes, sound speed and delay), times ``variance_factor``, so that their
+            traces are the squares of :func:`jaxcal.predicted_tre`; and the points' own. They do not
+            include the pose's, nor the verdict's ``tre_factor``.
 
         Raises:
             InputError: shapes that do not agree, NaN or numbers over 1e9, a negative SD, or a pose
@@ -264,7 +275,8 @@ class ImageTransform:
         factor = self.error_factor(pixels)
         spread = np.zeros(3)
         spread[[0, 2]] = own * self._mm_per_px()
-        covariance = factor @ factor.swapaxes(1, 2) + rotation @ np.diag(spread**2) @ rotation.T
+        covariance = self.variance_factor * factor @ factor.swapaxes(1, 2)
+        covariance = covariance + rotation @ np.diag(spread**2) @ rotation.T
         if pose is None:
             return AppliedPoints(points, covariance)
         given = real_array(pose, "pose")
@@ -280,7 +292,8 @@ class ImageTransform:
         """F with F z the errors of image points in the probe's frame, mm; z are standard normals.
 
         The errors of all points come from the same z: those of the calibration's unknowns. F F' of
-        a point is its covariance in :meth:`apply`; NaN where the calibration's is not known.
+        a point, times ``variance_factor``, is its covariance in :meth:`apply`; NaN where the
+        calibration's is not known.
 
         Args:
             pixels: as in :meth:`apply`.
@@ -393,6 +406,8 @@ def _checked(values: dict[str, np.ndarray]) -> Float[np.ndarray, "4 4"]:
             raise InputError(f"{name} holds NaN or Inf")
         if name in ("scale_mm_per_px", "range_factor", "tre_factor") and not (array > 0).all():
             raise InputError(f"{name} must be positive")
+        if name in ("degrees_of_freedom", "variance_factor") and array < 1:
+            raise InputError(f"{name} must be at least 1")
         if name in ("covariance", "image_covariance") and (np.diag(array) < 0).any():
             raise InputError(f"{name} holds a negative variance")
         if name in ("covariance", "image_covariance") and not _is_symmetric(array):

@@ -28,7 +28,7 @@ from jaxcal import InputError
 from jaxcal.data.geometry import matrix_from_rotation
 from jaxcal.data.probe import L14_5, CurvilinearProbe, Probe, check_probe
 from jaxcal.data.problem import Channels, Problem
-from jaxcal.data.recording import MINIMUM_IMAGES, Recording, Truth, make_images
+from jaxcal.data.recording import MINIMUM_IMAGES, MOST_IMAGES, Recording, Truth, make_images
 from jaxcal.data.segmentation.deviations import fit_deviations, halves
 from jaxcal.data.segmentation.time_of_flight import fit_in_plane
 from jaxcal.model import unrolled
@@ -110,8 +110,8 @@ class Protocol:
     tracker_rad: Scalar = 0.0
 
     def __post_init__(self) -> None:
-        whole_number("images", self.images, MINIMUM_IMAGES, 100_000)
-        whole_number("test_images", self.test_images, 0, 100_000)
+        whole_number("images", self.images, MINIMUM_IMAGES, MOST_IMAGES)
+        whole_number("test_images", self.test_images, 0, MOST_IMAGES)
         try:
             shallow, deep = self.depth_mm
         except (TypeError, ValueError):

@@ -61,9 +61,10 @@ import numpy as np
 from jaxcal import InputError
 from jaxcal.calibration.calibrate import ALTERNATION, Request, check_alternation, check_request
 from jaxcal.data.probe import LinearProbe
+from jaxcal.data.recording import MINIMUM_IMAGES, MOST_IMAGES
 from jaxcal.io.given_files import naming
 from jaxcal.io.toml import load_toml, parse_toml
-from jaxcal.runtime.given_values import whole_number
+from jaxcal.runtime.given_values import LARGEST_SEED, whole_number
 from jaxcal.runtime.messages import quoted, shown
 from jaxcal.solvers.names import Method, PriorName
 from jaxcal.solvers.plan import DEFAULT_MAX_ELEVATION_MM, Options, Prior
@@ -94,7 +95,7 @@ UNITS = {
 }
 """Unit of every array of a chunk."""
 
-_COUNTS = {"images": (4, 100_000), "test_images": (2, 100_000)}
+_COUNTS = {"images": (MINIMUM_IMAGES, MOST_IMAGES), "test_images": (2, MOST_IMAGES)}
 _LARGEST = {"rotation_deg": 180.0, "test_fraction": 10.0, "tracker_deg": 57.0}
 _LARGEST_MM = 1000.0
 """Of every number of ``[conditions]`` that is in mm; the least is 0."""
@@ -349,7 +350,7 @@ def _head(content: dict[str, Any]) -> tuple[str, int, int, int]:
     name = _required(content, "name")
     if not (isinstance(name, str) and re.fullmatch(r"[A-Za-z0-9_-]{1,100}", name)):
         raise InputError("name must be 1 to 100 letters, digits, - and _")
-    seed = whole_number("seed", _required(content, "seed"), 0, 2**63 - 1)
+    seed = whole_number("seed", _required(content, "seed"), 0, LARGEST_SEED)
     trials = whole_number("trials", _required(content, "trials"), 1, MAXIMUM_EXPERIMENTS)
     chunk = whole_number("chunk_trials", content.get("chunk_trials", 512), 1, 2**20)
     return name, seed, trials, min(chunk, trials)
