@@ -73,6 +73,12 @@ LARGEST_CHANGE = 0.4
 The evidence is stationary in the sites, so it is nearly right before the mean is. Only laws that do
 not settle at all need to be left out."""
 
+LARGEST_GAIN = 5.0
+"""... and as long as the last sweep but one changed the log evidence by no more than about this.
+
+Where edges exclude an image, the evidence may rise or fall by thousands between sweeps, as rounding
+has it; where it settles, it changes by tenths."""
+
 MEDIAN_STEPS = 12
 """Weiszfeld's steps to the median."""
 
@@ -284,7 +290,8 @@ def answers_under(model: Linearised, sites: Sites, shapes: tuple[Shape, ...]) ->
     mean, covariance = barrier(known.lifted(found.mean, found.covariance))
     variance = covariance[-1, -1]
     belief = mean_belief(model.mean + mean[-1], variance, sd, model.trust)
-    weight, good = weights(found.log_evidence + log_evidence_gain(belief), found.change, prior)
+    evidence = found.log_evidence + log_evidence_gain(belief)
+    weight, good = weights(evidence, found.log_evidence_change, found.change, prior)
     # The other unknowns follow b.
     along = covariance[:, -1] / variance
     # Values of a law are computed once, and not again for every entry of its covariance.
@@ -366,15 +373,19 @@ def median(
 
 
 def weights(
-    log_evidence: Float[Array, "k ..."], change: Float[Array, "k ..."], prior: Float[Array, " k"]
+    log_evidence: Float[Array, "k ..."],
+    gain: Float[Array, "k ..."],
+    change: Float[Array, "k ..."],
+    prior: Float[Array, " k"],
 ) -> tuple[Array, Array]:
     """The laws' probabilities, and which laws have finite results.
 
-    A law whose belief still moves loses weight: the more it moves, the more weight.
+    A law whose belief or evidence still moves loses weight: the more it moves, the more weight.
     """
-    good = jnp.isfinite(log_evidence) & jnp.isfinite(change)
+    good = jnp.isfinite(log_evidence) & jnp.isfinite(gain) & jnp.isfinite(change)
     prior = prior.reshape(-1, *(1,) * (log_evidence.ndim - 1))
     moving = (jnp.where(good, change, 0.0) / LARGEST_CHANGE) ** 4
+    moving = moving + (jnp.where(good, gain, 0.0) / LARGEST_GAIN) ** 4
     score = jnp.where(good, log_evidence, 0.0) + jnp.log(prior) - moving
     score = jnp.where(good, score, -jnp.inf)
     # Where no law is good the weights must still be numbers: a problem's NaN poisons its gradient.

@@ -212,12 +212,14 @@ class Posterior(eqx.Module):
         mean: of z.
         covariance: of z.
         log_evidence: up to a constant that the laws share.
+        log_evidence_change: by how much the last sweep but one changed it.
         change: length of the last sweep's move of the mean, in SDs.
     """
 
     mean: Float[Array, "6 *k batch"]
     covariance: Float[Array, "6 6 *k batch"]
     log_evidence: Float[Array, "*k batch"]
+    log_evidence_change: Float[Array, "*k batch"]
     change: Float[Array, "*k batch"]
 
 
@@ -337,7 +339,8 @@ class _Laws(eqx.Module):
         belief = self.gaussian(sd).belief
         used, square = total([self.sites.used, self.sites.used * self.sites.offset**2])
         site = -0.5 * (used * jnp.log(2 * np.pi * sd**2) + square / sd**2)
-        return Posterior(belief.mean, belief.covariance, belief.evidence(site), jnp.zeros_like(sd))
+        none = jnp.zeros_like(sd)
+        return Posterior(belief.mean, belief.covariance, belief.evidence(site), none, none)
 
     def swept(
         self, family: Array, sd: Float[Array, " batch"], state: _Propagation, sweeps: int
@@ -345,25 +348,25 @@ class _Laws(eqx.Module):
         """Take ``sweeps`` sweeps under a law; the evidence is that before the last one."""
 
         def sweep(k: Array, carry: tuple) -> tuple:
-            before, _ = carry
-            after, evidence, dominated = self.sweep(family, sd, before, k == sweeps - 1)
+            before, (earlier, _, _) = carry
+            after, evidence, dominated = self.sweep(family, sd, before, k >= sweeps - 2)
             step = after.belief.mean - before.belief.mean
             length = jnp.sum(
                 step * dense.product_batch_last(after.belief.information, step), axis=0
             )
             change = jnp.where(dominated, jnp.inf, jnp.sqrt(jnp.maximum(length, 0.0)))
-            return after, (evidence, change)
+            return after, (evidence, evidence - earlier, change)
 
         none = jnp.zeros_like(sd)
-        state, (evidence, change) = jax.lax.fori_loop(0, sweeps, sweep, (state, (none, none)))
-        return state, Posterior(state.belief.mean, state.belief.covariance, evidence, change)
+        state, found = jax.lax.fori_loop(0, sweeps, sweep, (state, (none, none, none)))
+        return state, Posterior(state.belief.mean, state.belief.covariance, *found)
 
     def sweep(
-        self, family: Array, sd: Float[Array, " batch"], state: _Propagation, last: Array
+        self, family: Array, sd: Float[Array, " batch"], state: _Propagation, late: Array
     ) -> tuple[_Propagation, Array, Array]:
         """Update all sites once; the log evidence before, and where a site dominates the others.
 
-        These two are computed in the last sweep, and are without meaning in the others.
+        These two are computed in the last two sweeps, and are without meaning in the others.
         """
         h, offset, used = self.sites.direction, self.sites.offset, self.sites.used
         tau, nu, belief = state.tau, state.nu, state.belief
@@ -386,7 +389,7 @@ class _Laws(eqx.Module):
 
         # The evidence is stationary in the sites, so it is as good before the last sweep as after.
         none = jnp.zeros_like(sd)
-        site, dominated = jax.lax.cond(last, judged, lambda: (none, none))
+        site, dominated = jax.lax.cond(late, judged, lambda: (none, none))
 
         new_tau, new_nu = refreshed(found, centre, without)
         tau = tau + DAMPING * used * (new_tau - tau)

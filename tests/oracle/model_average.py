@@ -56,6 +56,7 @@ class Recipe:
     sweeps: int = 3
     damping: float = 0.8
     largest_change: float = 0.4
+    largest_gain: float = 5.0
     median_steps: int = 12
     probability_of_mean: float = 0.1
     lags: int = 5
@@ -370,6 +371,7 @@ class Belief:
     mean: np.ndarray
     covariance: np.ndarray
     log_evidence: float
+    gain: float
     change: float
 
 
@@ -401,6 +403,16 @@ def propagate(linear: Linear, sd: float, recipe: Recipe, bound: np.ndarray | Non
         tau = np.maximum(1 / found[2] - 1 / without, -0.2 / without)
         return tau, (tau + 1 / without) * found[1] - centre / without
 
+    def evidence_of(family, scale, tau, nu) -> float:
+        covariance, mean, information, right = belief(tau, nu)
+        found, centre, without = tilt(family, scale, tau, nu, covariance, mean)
+        # ln of the integral of mass_i N(u; centre, without) against the site, image by image.
+        joined = 1 + tau * without
+        site = found[0] + 0.5 * np.log(joined)
+        site -= 0.5 * ((centre + without * nu) ** 2 / joined - centre**2) / without
+        site += nu * o - 0.5 * tau * o**2
+        return site.sum() + 0.5 * right @ mean - 0.5 * np.linalg.slogdet(information)[1]
+
     result: dict[int, Belief] = {}
     for family in dict.fromkeys(each.family for each in recipe.distributions):
         members = [k for k, each in enumerate(recipe.distributions) if each.family == family]
@@ -417,24 +429,21 @@ def propagate(linear: Linear, sd: float, recipe: Recipe, bound: np.ndarray | Non
             tau, nu = sweep(scales[0], tau, nu)
         for k, scale in zip(members, scales, strict=True):
             for _ in range(500 if recipe.exactly else recipe.sweeps - 1):
-                last = tau
+                last = tau, nu
                 tau, nu = sweep(scale, tau, nu)
-                if recipe.exactly and np.abs(tau - last).max() < 1e-13 * np.abs(tau).max():
+                if recipe.exactly and np.abs(tau - last[0]).max() < 1e-13 * np.abs(tau).max():
                     break
-            covariance, before, information, right = belief(tau, nu)
+            earlier = evidence_of(family, scale, *last)
+            evidence = evidence_of(family, scale, tau, nu)
+            covariance, before, information, _ = belief(tau, nu)
             found, centre, without = tilt(family, scale, tau, nu, covariance, before)
-            # ln of the integral of mass_i N(u; centre, without) against the site, image by image.
-            joined = 1 + tau * without
-            site = found[0] + 0.5 * np.log(joined)
-            site -= 0.5 * ((centre + without * nu) ** 2 / joined - centre**2) / without
-            site += nu * o - 0.5 * tau * o**2
-            evidence = site.sum() + 0.5 * right @ before - 0.5 * np.linalg.slogdet(information)[1]
             crowded = bool((tau * without > 990).any())
             new = sites(found, centre, without)
             tau, nu = (tau + recipe.damping * (new[0] - tau), nu + recipe.damping * (new[1] - nu))
             covariance, mean, information, _ = belief(tau, nu)
             change = float(np.sqrt((mean - before) @ information @ (mean - before)))
-            result[k] = Belief(mean, covariance, evidence, np.inf if crowded else change)
+            gain = evidence - earlier
+            result[k] = Belief(mean, covariance, evidence, gain, np.inf if crowded else change)
     return [result[k] for k in range(len(recipe.distributions))]
 
 
@@ -540,7 +549,7 @@ def _average(
         score = np.full(len(prior), -np.inf)
         for k, belief in enumerate(beliefs):
             changes.append(belief.change)
-            if not (np.isfinite(belief.log_evidence) and np.isfinite(belief.change)):
+            if not np.isfinite([belief.log_evidence, belief.gain, belief.change]).all():
                 means.append(np.zeros(len(away)))
                 within.append(np.eye(len(away)))
                 with_mean.append(0.0)
@@ -554,6 +563,7 @@ def _average(
             )
             with_mean.append(found.probability)
             settled = (belief.change / recipe.largest_change) ** 4
+            settled += (belief.gain / recipe.largest_gain) ** 4
             score[k] = belief.log_evidence + found.log_gain + np.log(prior[k]) - settled
         weight.append(share * np.exp(score - logsumexp(score)))
     means, within, weight = np.stack(means), np.stack(within), np.concatenate(weight)
