@@ -73,11 +73,11 @@ LARGEST_CHANGE = 0.4
 The evidence is stationary in the sites, so it is nearly right before the mean is. Only laws that do
 not settle at all need to be left out."""
 
-LARGEST_GAIN = 5.0
+LARGEST_GAIN = 10.0
 """... and as long as the last sweep but one changed the log evidence by no more than about this.
 
 Where edges exclude an image, the evidence may rise or fall by thousands between sweeps, as rounding
-has it; where it settles, it changes by tenths."""
+has it; where it settles, it changes by tenths, which must not matter."""
 
 MEDIAN_STEPS = 12
 """Weiszfeld's steps to the median."""
@@ -385,7 +385,9 @@ def weights(
     good = jnp.isfinite(log_evidence) & jnp.isfinite(gain) & jnp.isfinite(change)
     prior = prior.reshape(-1, *(1,) * (log_evidence.ndim - 1))
     moving = (jnp.where(good, change, 0.0) / LARGEST_CHANGE) ** 4
-    moving = moving + (jnp.where(good, gain, 0.0) / LARGEST_GAIN) ** 4
+    # No more than what takes all weight: the derivative must not overflow.
+    rising = jnp.minimum(jnp.abs(jnp.where(good, gain, 0.0)) / LARGEST_GAIN, 100.0)
+    moving = moving + rising**8
     score = jnp.where(good, log_evidence, 0.0) + jnp.log(prior) - moving
     score = jnp.where(good, score, -jnp.inf)
     # Where no law is good the weights must still be numbers: a problem's NaN poisons its gradient.

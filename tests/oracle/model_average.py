@@ -56,7 +56,7 @@ class Recipe:
     sweeps: int = 3
     damping: float = 0.8
     largest_change: float = 0.4
-    largest_gain: float = 5.0
+    largest_gain: float = 10.0
     median_steps: int = 12
     probability_of_mean: float = 0.1
     lags: int = 5
@@ -563,7 +563,7 @@ def _average(
             )
             with_mean.append(found.probability)
             settled = (belief.change / recipe.largest_change) ** 4
-            settled += (belief.gain / recipe.largest_gain) ** 4
+            settled += (belief.gain / recipe.largest_gain) ** 8
             score[k] = belief.log_evidence + found.log_gain + np.log(prior[k]) - settled
         weight.append(share * np.exp(score - logsumexp(score)))
     means, within, weight = np.stack(means), np.stack(within), np.concatenate(weight)
