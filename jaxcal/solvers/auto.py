@@ -298,13 +298,14 @@ def answers_under(model: Linearised, sites: Sites, shapes: tuple[Shape, ...]) ->
     belief, weight, good, along = barrier((belief, weight, good, along))
     mean = mean + along * (belief.mean - model.mean - mean[-1])
     covariance = covariance + along[:, None] * along * (belief.variance - variance)
+    still = (found.change < LARGEST_CHANGE) & (jnp.abs(found.log_evidence_change) < LARGEST_GAIN)
     size = len(mean)
     return Answers(
         jnp.where(good, mean, 0.0),
         jnp.where(good, covariance, jnp.eye(size, dtype=mean.dtype)[:, :, None, None]),
         weight,
         jnp.where(good, belief.probability, 0.0),
-        jnp.any(good & (found.change < LARGEST_CHANGE), axis=0),
+        jnp.any(good & still, axis=0),
     )
 
 
