@@ -39,10 +39,13 @@ def test_frames_that_come_twice_are_used_once_and_counted(bridge):
         next_frames(device, 3)
         bridge.again = 2
         frames = next_frames(device, 12)
+        # What was on its way before came once; on a busy machine that may be many.
+        while device.statistics().repeated < 16:
+            frames += next_frames(device, 1)
+            assert len(frames) < 500
         numbers = [frame.frame for frame in frames]
-        assert numbers == list(range(numbers[0], numbers[0] + 12))
+        assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
         counts = device.statistics()
-    assert counts.repeated >= 16
     assert (counts.restarts, counts.lost) == (0, 0)
 
 
