@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxcal import Problem, Protocol, reconstruction_precision, simulate
 from jaxcal.io.atomic import atomic_path
+from jaxcal.report.svg import ink
 from jaxcal.study.laws import LawName
 from jaxcal.study.simulation import NUMBERS, Experiment
 
@@ -89,9 +90,14 @@ def grid_panel(panel: Axes, grid: Float[np.ndarray, "elevations noises"], half: 
         grid: a row for each of the last elevations, a column for each noise; NaN for none.
         half: of the range of colours.
     """
-    panel.imshow(grid, cmap="RdBu_r", vmin=1 - half, vmax=1 + half, origin="lower")
+    from matplotlib.colors import to_hex
+
+    image = panel.imshow(grid, cmap="RdBu_r", vmin=1 - half, vmax=1 + half, origin="lower")
     for i, j in np.argwhere(np.isfinite(grid)):
-        panel.text(j, i, f"{grid[i, j]:.2f}", ha="center", va="center", fontsize="small")
+        panel.text(
+            j, i, f"{grid[i, j]:.2f}", ha="center", va="center", fontsize="small",
+            color=ink(to_hex(image.to_rgba(grid[i, j]))),
+        )  # fmt: skip
     panel.set_xticks(range(len(NOISES_MM)), [f"{noise:g}" for noise in NOISES_MM])
     panel.set_yticks(range(len(grid)), [f"{size:g}" for size in ELEVATIONS_MM[-len(grid) :]])
     panel.set(xlabel="noise on each distance, SD (mm)", ylabel="size of the offsets (mm)")

@@ -1,7 +1,7 @@
 """Errors that the model leaves out: how often are they told of, and what becomes of the verdict?
 
 Simulated recordings (uniform offsets of SD 1 mm, noise level 1) without any fault and with one of
-nine, calibrated with the default prior:
+ten, calibrated with the default prior:
 
 - ``scale``: ranges 4 % too long (a sound speed of 1540 m/s in water of 1480 m/s);
 - ``skew``: lateral positions off by 3 % of the depth;
@@ -13,7 +13,9 @@ nine, calibrated with the default prior:
 - ``distortion``: a piece of metal near the tracker moves the tracked positions by the field of a
   dipole, 1 mm root mean square about its mean. It is 2.5 times as far from the middle of the
   positions as these are (root mean square), anywhere, and points anywhere;
-- ``targets``: a third of the images, any of them, show a second target, 12 mm from the first.
+- ``targets``: a third of the images, any of them, show a second target, 12 mm from the first;
+- ``lateral``: lateral positions 4 % too long. The sound speed is estimated, as in ``none, sound
+  speed estimated``, which has no fault.
 
 For each: the share in which something is told of (a kind of error that the model leaves out, or
 two groups), in which it is the right thing, in which two targets are told of, in which the verdict
@@ -47,8 +49,9 @@ from jaxcal.runtime.jax_cache import enable_compilation_cache
 SEED = 20261123
 FAULTS = (
     "none", "scale", "skew", "beside", "slip", "second echo", "curve", "step", "distortion",
-    "targets",
+    "targets", "none, sound speed estimated", "lateral",
 )  # fmt: skip
+SPEED_ESTIMATED = ("none, sound speed estimated", "lateral")
 IMAGES = (12, 30, 60)
 STRETCH, SKEW, BESIDE_MM, SLIP_MM, ECHO_MM, ECHO_SHARE = 1.04, 0.03, 6.0, 2.0, 5.0, 0.4
 CURVE_MM, DISTORTION_MM, METAL = 1.0, 1.0, 2.5
@@ -86,6 +89,8 @@ def draw(images: int, fault: str, indices: Array):
         size = jnp.ones(2)
         if fault == "scale":
             points, size = points * jnp.array([1.0, STRETCH]), jnp.array([1.0, 1 / STRETCH])
+        if fault == "lateral":
+            points, size = points * jnp.array([STRETCH, 1.0]), jnp.array([1 / STRETCH, 1.0])
         if fault == "skew":
             points = points.at[:, 0].add(SKEW * points[:, 1])
         if fault == "beside":
@@ -153,13 +158,14 @@ def main() -> None:
     condition = 0
     for fault in FAULTS:
         for images in IMAGES:
-            trials = 20 if quick else 1000 if fault == "none" else 200
+            trials = 20 if quick else 1000 if fault.startswith("none") else 200
             poses, points, x, size = map(
                 np.asarray, draw(images, fault, condition * 1_000_000 + jnp.arange(trials))
             )
             condition += 1
             recordings = [Recording(make_images(*each)) for each in zip(poses, points, strict=True)]
-            results = jaxcal.calibrate_batch(recordings).numpy()
+            estimate = "sound-speed" if fault in SPEED_ESTIMATED else ()
+            results = jaxcal.calibrate_batch(recordings, estimate=estimate).numpy()
             told = [judged(results[k], recordings[k], x[k], size[k], fault) for k in range(trials)]
             shares = np.mean(told, axis=0)
             rows.append([fault, images, trials, *map(float, shares)])
