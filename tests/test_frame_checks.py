@@ -19,6 +19,7 @@ from jaxcal.cli.plan import refuse_wrong_lengths
 from jaxcal.data.poses import inverse_poses
 from jaxcal.data.recording import make_images
 from jaxcal.diagnostics.frame_checks import doubtful_unit, wrong_frames
+from jaxcal.diagnostics.warnings import warnings
 from jaxcal.io.text import read_crosswire
 from jaxcal.report.next_poses import next_poses_record
 from jaxcal.report.record import calibration_record
@@ -158,6 +159,15 @@ def test_pixels_that_no_image_has_are_told(slips):
         said = wrong_frames(Problem.from_recording(replace(right, poses=poses).images()))
         assert said is not None
         assert re.match(rf"the pixels come out as {size} mm: are the poses", said)
+
+
+def test_points_in_mm_that_are_taken_for_pixels_are_told(slips):
+    """Pixels of just under 1 mm were taken for usual ones, larger ones for poses not in mm."""
+    right = slips.recorded(2, "mm")
+    for size, told in ((0.98, True), (1.02, True), (0.7, False)):
+        problem = Problem.from_arrays(right.poses, right.points / size, kind="pixel")
+        result = jaxcal.calibrate(problem, "conventional", estimate=("scale",))
+        assert any("are u and v in mm" in text for text in warnings(result)) == told
 
 
 def test_poses_composed_in_the_wrong_order_are_asked_about(slips):

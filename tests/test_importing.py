@@ -617,6 +617,8 @@ def test_a_stated_unit_is_not_advised_against(tmp_path):
         ("x.XLSX", "save its numbers as a table"),
         ("x.npy", "save its numbers as a table"),
         ("results.xml", "jaxcal export, apply and compare read"),
+        ("ImageToProbe.tfm", "jaxcal export, apply and compare take it as CAL"),
+        ("tool.yaml", "jaxcal export, apply and compare take it as CAL"),
         ("frame.png", "name the folder"),
         ("clip.mp4", "save its frames as PNG"),
         ("scene.mrml", "save its sequence from Slicer as"),

@@ -661,6 +661,58 @@ def lagging(tmp_path):
     return times, points
 
 
+@pytest.mark.parametrize("late", [0.0, 0.12, 0.9])
+def test_a_lag_that_fits_the_points_better_is_told(tmp_path, late, capsys):
+    """Poses that were 0.1 s off were used without a word, and the calibration was called fair."""
+    log, times = np.arange(0, 41, 0.1), 2 + 0.9 * np.arange(40)
+    poses, target = turning(log), np.array([300.0, -40.0, 80.0])
+    seen = np.linalg.inv(turning(times - late)) @ [*target, 1]
+    rows = [[t, *pose[:3].ravel()] for t, pose in zip(log, poses, strict=True)]
+    names = ["time", *(f"m{i}{j}" for i in range(1, 4) for j in range(1, 5))]
+    table = [",".join(names), *(",".join(map(repr, map(float, row))) for row in rows)]
+    (tmp_path / "t.csv").write_text("\n".join(table))
+    points = 500 + 4 * seen[:, :2] + np.random.default_rng(2).normal(0, 1, (40, 2))
+    lines = [f"{t},{u},{v}" for t, (u, v) in zip(times, points, strict=True)]
+    (tmp_path / "p.csv").write_text("\n".join(["time,u,v", *lines]))
+    write_sequence(tmp_path / "i.igs.mha", {}, times)
+    images, given, log_table, out = (
+        str(tmp_path / name) for name in ("i.igs.mha", "p.csv", "t.csv", "o.h5")
+    )
+    said = {}
+    for name, arguments in {
+        "as it is": [images, given, out, "--poses", log_table],
+        "stated": [images, given, out, "--poses", log_table, "--lag", str(late)],
+        "tables": [log_table, given, out],
+    }.items():
+        assert main(["import", *arguments]) == 0
+        said[name] = capsys.readouterr().out
+    found = {
+        name: re.search(r"better at a lag of (\S+) s(.*)", text) for name, text in said.items()
+    }
+    assert found["stated"] is None
+    if late == 0:
+        assert not any(found.values())
+    elif late > 0.5:
+        assert "where the search ends, than at 0 s" in said["as it is"]
+        assert "do images and poses use the same clock?" in said["tables"]
+    else:
+        assert abs(float(found["as it is"][1]) - late) < 0.01
+        assert f"state it (--lag {found['as it is'][1]})" in said["as it is"]
+        assert f"subtract {found['tables'][1]} s from the images' times" in said["tables"]
+
+
+def turning(t: np.ndarray) -> np.ndarray:
+    """Poses that keep a target in front of the probe, which turns and moves in all directions."""
+    frequency, phase = np.array([0.9, 1.3, 0.7, 1.1, 1.7, 0.6]), np.arange(6)
+    wave = np.sin(t[:, None] * frequency + phase)
+    poses = np.tile(np.eye(4), (len(t), 1, 1))
+    poses[:, :3, :3] = Rotation.from_rotvec(0.5 * wave[:, :3]).as_matrix()
+    in_probe = [30, 20, 60] + wave[:, 3:] * [20, 15, 0.5]
+    turned = np.einsum("nij,nj->ni", poses[:, :3, :3], in_probe)
+    poses[:, :3, 3] = [300, -40, 80] - turned
+    return poses
+
+
 def test_a_lag_is_estimated_from_points(tmp_path, lagging, capsys):
     times, points = lagging
     sources = [str(tmp_path / name) for name in ("i.igs.mha", "p.csv", "o.h5")]

@@ -16,6 +16,7 @@ from jaxcal.data.timing import (
     can_interpolate,
     estimate_latency,
     fit_clock,
+    fitted_lag,
     interpolate_poses,
     interpolation_error,
     latency_of_positions,
@@ -293,3 +294,52 @@ def test_too_short_an_overlap() -> None:
     t = np.arange(0, 1.5, 0.008)
     with pytest.raises(InputError, match="overlap"):
         estimate_latency(t, motion(t), t, motion(t))
+
+
+def freehand(t: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Poses of a probe that moves in all directions, and where it sees a target at rest, px."""
+    rng = np.random.default_rng(seed)
+    frequency, phase = rng.uniform(0.1, 0.4, (6, 2)), rng.uniform(0, 6, (6, 2))
+    wave = np.sin(t[:, None, None] * frequency * 6 + phase).mean(axis=2)
+    pixels = [160, 120] + wave[:, 3:5] * [110, 80]
+    seen = np.column_stack([pixels * [0.2, 0.15], 0.8 * wave[:, 5]])
+    in_probe = seen @ Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix().T + [20, -35, 50]
+    poses = np.tile(np.eye(4), (len(t), 1, 1))
+    poses[:, :3, :3] = Rotation.from_rotvec(0.5 * wave[:, :3] + [1.0, 0.3, -2.0]).as_matrix()
+    turned = np.einsum("nij,nj->ni", poses[:, :3, :3], in_probe)
+    poses[:, :3, 3] = [100, -50, -900] - turned
+    return poses, pixels + rng.normal(0, 1, pixels.shape)
+
+
+@pytest.mark.parametrize("lag", [-0.21, 0.0, 0.1])
+@pytest.mark.parametrize("seed", range(4))
+def test_a_lag_is_told_of_any_motion(seed: int, lag: float) -> None:
+    t_image, t = 2 + 0.9 * np.arange(40), np.arange(0, 40, 0.03)
+    points = freehand(t_image - lag, seed)[1]
+    found = fitted_lag(t_image, points, t, freehand(t, seed)[0], max_gap_s=0.1)
+    assert found is not None
+    assert abs(found.lag_s - lag) < 4 * found.sd_s < 0.06
+    assert (found.evidence > 25) == (lag != 0)
+    assert found.misfit_mm < 0.8
+    assert lag == 0 or found.given_mm > 1.5 * found.misfit_mm
+
+
+def test_a_lag_is_not_told_of_a_probe_at_rest_or_of_few_images() -> None:
+    """A probe that is held still for each image: no lag fits better than another."""
+    t_image, t = 2 + 2.0 * np.arange(30), np.arange(0, 62, 0.03)
+    of_image = np.clip(np.round((t - 2) / 2), 0, 29).astype(int)
+    still, points = freehand(t_image, 1)
+    found = fitted_lag(t_image, points, t, still[of_image], max_gap_s=0.1)
+    assert found is not None
+    assert found.evidence < 9
+    assert fitted_lag(t_image[:11], points[:11], t, still[of_image], max_gap_s=0.1) is None
+    one = np.full((30, 2), 7.0)
+    assert fitted_lag(t_image, one, t, still[of_image], max_gap_s=0.1) is None
+
+
+def test_clocks_that_are_apart_by_more_than_is_searched() -> None:
+    t_image, t = 2 + 0.9 * np.arange(40), np.arange(0, 40, 0.03)
+    found = fitted_lag(t_image, freehand(t_image - 0.9, 2)[1], t, freehand(t, 2)[0], max_gap_s=0.1)
+    assert found is not None
+    assert (found.lag_s, found.sd_s) == (0.5, np.inf)
+    assert found.evidence > 25

@@ -42,6 +42,9 @@ _MINIMUM_CORRELATION = 0.8
 _COARSEST_S = 1e-3
 """A clock's times, as seconds, have digits for at least a millisecond."""
 _PARABOLA_STEPS, _TOP = 5, 0.99
+_FIT_STEP_S = 0.025
+_FIT_IMAGES = 12, 200
+"""Least and most images that are fitted at every lag."""
 
 
 def _increasing(t: np.ndarray, what: str, minimum: int = 2) -> Float[np.ndarray, " n"]:
@@ -376,6 +379,106 @@ def latency_of_positions(
             "along one line of the image"
         )
     return replace(found, sd_s=float(np.sqrt(variance)))
+
+
+@dataclass(frozen=True)
+class FittedLag:
+    """The lag at which images of a target at rest fit the poses best.
+
+    Attributes:
+        lag_s: an image stamped t fits the pose at t - lag best.
+        sd_s: standard deviation of the lag, s; infinite at the edge of the search.
+        misfit_mm: root mean square distance of the images' targets from one place, at this lag.
+        given_mm: the same without a lag.
+        evidence: how much larger the sum of squares is without a lag, in variances of one image;
+            the square of a standard normal if there is none.
+    """
+
+    lag_s: float
+    sd_s: float
+    misfit_mm: float
+    given_mm: float
+    evidence: float
+
+
+def fitted_lag(
+    t_image: np.ndarray,
+    points: np.ndarray,
+    t: np.ndarray,
+    poses: np.ndarray,
+    *,
+    max_gap_s: float,
+    valid: np.ndarray | None = None,
+) -> FittedLag | None:
+    """Lag of the images behind the poses from a target at rest, whatever the probe's motion.
+
+    At every lag up to ``LARGEST_LAG_S``, in both directions, the target's place and an affine map
+    from image to probe are fitted to the images by linear least squares. A parabola through the
+    least sum of squares and its neighbours refines the lag. A probe that is held still for each
+    image tells nothing: the evidence is then small.
+
+    Args:
+        t_image: (n,) stamps of the images, s, on the tracker's clock.
+        points: (n, 2) the target in them, px or mm.
+        t: (m,) times of the poses, s, increasing.
+        poses: (m, 4, 4), probe -> tracker, mm.
+        max_gap_s: longest time between neighbouring poses that is bridged.
+        valid: (m,) bool; False where a pose cannot be used. None: all can.
+
+    Returns:
+        None if there are too few images with poses at all lags, or if nothing can be fitted.
+
+    Raises:
+        InputError: times out of order or not numbers, or poses that are not rigid.
+    """
+    steps = round(LARGEST_LAG_S / _FIT_STEP_S)
+    lags = np.arange(-steps, steps + 1) * _FIT_STEP_S
+    asked = np.asarray(t_image)[:, None] - lags
+    # The same images at every lag: a lag with fewer images could win by chance.
+    between = can_interpolate(t, asked.ravel(), max_gap_s=max_gap_s, valid=valid)
+    rows = np.flatnonzero(between.reshape(asked.shape).all(axis=1))
+    least, most = _FIT_IMAGES
+    if len(rows) < least:
+        return None
+    rows = rows[np.unique(np.linspace(0, len(rows) - 1, most).astype(int))]
+    found = interpolate_poses(t, poses, asked[rows].ravel(), max_gap_s=max_gap_s, valid=valid)
+    found = found.reshape(len(rows), len(lags), 4, 4)
+    centred = np.asarray(points)[rows] - np.mean(np.asarray(points)[rows], axis=0)
+    size = np.sqrt(np.mean(centred**2))
+    if not size > 0 or not np.ptp(np.asarray(t_image)[rows]) > 0:
+        return None
+    plane = np.column_stack([centred / size, np.ones(len(rows))])
+    squares = np.array([_affine_misfit(found[:, k], plane) for k in range(len(lags))])
+    best = int(np.argmin(squares))
+    # Most of the misfit is the target's distance from the image plane: one number an image. The
+    # affine map, the target's place and the lag have 13 unknowns, for three coordinates an image.
+    variance = squares[best] / (len(rows) - 13 / 3)
+    # Errors of images taken at short intervals are alike, and count as fewer.
+    lasting = float(np.ptp(np.asarray(t_image)[rows]))
+    variance *= max((len(rows) - 1) * LARGEST_LAG_S / lasting, 1.0)
+    lag, sd = float(lags[best]), np.inf
+    if 0 < best < len(lags) - 1:
+        bend, slope, _ = np.polyfit(
+            lags[best - 1 : best + 2] - lag, squares[best - 1 : best + 2], 2
+        )
+        if bend > 0:
+            lag, sd = lag - slope / (2 * bend), float(np.sqrt(variance / bend))
+    if not variance > 0:
+        return None
+    misfit, given = np.sqrt(squares[[best, steps]] / len(rows))
+    evidence = (squares[steps] - squares[best]) / variance
+    return FittedLag(float(lag), sd, float(misfit), float(given), float(evidence))
+
+
+def _affine_misfit(poses: Float[np.ndarray, "n 4 4"], plane: Float[np.ndarray, "n 3"]) -> float:
+    """Sum of squares of R M q + t - c over images; the matrix M and the place c are fitted."""
+    turn, count = poses[:, :3, :3], len(poses)
+    of_map = np.einsum("nij,nl->nijl", turn, plane).reshape(count, 3, 9)
+    design = np.concatenate([of_map, np.tile(-np.eye(3), (count, 1, 1))], axis=2).reshape(-1, 12)
+    # About the mean, whose distance from the tracker would cost digits.
+    wanted = -(poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0)).ravel()
+    solution = np.linalg.lstsq(design, wanted, rcond=None)[0]
+    return float(np.sum((design @ solution - wanted) ** 2))
 
 
 def _along_principal_axes(positions: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:

@@ -16,6 +16,8 @@ IMPLAUSIBLE_RMS_MM = 10.0
 """Residuals with a larger root mean square do not come from a target within the beam."""
 USUAL_PIXEL_MM = (0.02, 1.0)
 """Estimated pixel sizes outside this interval lead to a warning."""
+_MILLIMETRE = 0.1
+"""So do pixels whose sides are 1 mm to within this share: points in mm look like that."""
 FARTHEST_MM = 800.0
 """If the target is farther from the origin of the probe's frame, there is a warning. Instruments
 that are tracked at their handle are half a metre long."""
@@ -201,6 +203,11 @@ def _unusual_pixels(result: Calibration) -> list[str]:
     if result.scale_mm_per_px is None or problem is None or problem.spacing_known:
         return []
     lateral, axial = (float(size) for size in np.asarray(result.scale_mm_per_px))
+    if max(abs(lateral - 1), abs(axial - 1)) < _MILLIMETRE:
+        return [
+            f"pixels of {lateral:.3g} x {axial:.3g} mm are unusual for ultrasound: are u and v in "
+            "mm, as on an image with a spacing? Then import them with --units mm"
+        ]
     least, largest = USUAL_PIXEL_MM
     if least <= min(lateral, axial) and max(lateral, axial) <= largest:
         return []

@@ -176,7 +176,8 @@ def columns_of_header(names: list[str], quaternion: QuaternionOrder | None) -> C
 def _unknown(names: list[str], column: int) -> FormatError:
     return FormatError(
         f"the header's column {column + 1}, {quoted(names[column])}, is not known: name the "
-        "columns time, frame, u, v, x, y, z, qx, qy, qz, qw or m11 to m34, or leave the header out"
+        "columns time, frame, u, v, x, y, z, qx, qy, qz, qw or m11 to m34 (comment: one that is "
+        "not read), or leave the header out"
     )
 
 

@@ -20,7 +20,7 @@ from jaxcal import InputError
 from jaxcal.data.recording import MetresError, Recording, make_images
 from jaxcal.io.frame_points import FramePoints, points_of_markups, points_of_table
 from jaxcal.io.frame_poses import opened, tracked_poses
-from jaxcal.io.poses_by_time import lag_of_points, with_poses_by_time
+from jaxcal.io.poses_by_time import better_lag, lag_of_points, with_poses_by_time
 from jaxcal.io.sequence import Pixels, TrackedSequence
 from jaxcal.io.sources import SEQUENCES, ImportOptions, kind_of, read_rows, refuse
 from jaxcal.io.table import first_line, parse_numbers, read_table
@@ -197,6 +197,8 @@ def _from_sequence(
             used = _usable_points(sequence, placed, valid)
             given, what = len(placed.rows), "points"
         time, said = None, []
+        if tracking is not None and options.lag_s != "auto":
+            notes += better_lag(sequence.time[used.rows], used.points, tracking, options.lag_s)
         if np.isfinite(sequence.time[used.rows]).all():
             time, said = _good_time(
                 sequence.time[used.rows],

@@ -10,6 +10,7 @@ from jaxcal import InputError
 from jaxcal.data.poses import check_poses
 from jaxcal.data.timing import (
     can_interpolate,
+    fitted_lag,
     interpolate_poses,
     interpolation_error,
     latency_of_positions,
@@ -28,6 +29,8 @@ _SHARED = 0.2
 1.25 intervals between poses."""
 _TOLD_MM = 0.5
 """Larger errors of interpolation are told; the noise of a tracker looks like smaller ones."""
+_LAG_EVIDENCE = 25.0
+"""A lag is told if its evidence is larger: a normal variable's square at 5 SD."""
 _ROUNDED_S = 1e-6
 """Times that were written as text and read again may be off by so much."""
 
@@ -114,6 +117,42 @@ def with_poses_by_time(
         length_stated=tracking.length_stated,
         without_status=(),
     ), notes
+
+
+def better_lag(
+    time: Float[np.ndarray, " n"],
+    points: Float[np.ndarray, "n 2"],
+    tracking: TrackedSequence,
+    lag_s: float | None = 0.0,
+) -> list[str]:
+    """A note if another lag fits the points far better than the one that was used.
+
+    Args:
+        time: of the images, s, on the clock of ``tracking``.
+        points: the target in them, px or mm.
+        tracking: the poses alone, which :func:`with_poses_by_time` has taken.
+        lag_s: the lag that was used; None if times have to be changed to state one.
+    """
+    ((pair, poses),) = tracking.transforms.items()
+    kept = _increasing(tracking)
+    times, valid, given = tracking.time[kept], tracking.valid[pair][kept], lag_s or 0.0
+    gap = LONGEST_GAP * float(np.median(np.diff(times)))
+    poses = poses[kept]
+    found = fitted_lag(time - given, points, times, poses, max_gap_s=gap, valid=valid)
+    if found is None or found.evidence <= _LAG_EVIDENCE:
+        return []
+    told = given + found.lag_s
+    sure, state = f" (SD {found.sd_s:.2g} s)", f"state it (--lag {told:.3f})"
+    if not np.isfinite(found.sd_s):
+        sure, state = ", where the search ends,", "do images and poses use the same clock?"
+    elif lag_s is None:
+        change = ("subtract", "from") if told > 0 else ("add", "to")
+        state = f"{change[0]} {abs(told):.3f} s {change[1]} the images' times"
+    return [
+        f"the points fit the poses better at a lag of {told:.3f} s{sure} than at {given:g} s: the "
+        f"target comes out within {found.misfit_mm:.2g} mm of one place (RMS), not "
+        f"{found.given_mm:.2g} mm; {state}, or hold the probe still for each image"
+    ]
 
 
 def _check_unit(

@@ -85,6 +85,9 @@ SEQUENCES = ("sequence", "tracker", "scan", "folder")
 _AS_TABLE = " (save its numbers as a table, CSV)"
 _NOT_IMPORTED = {
     ".xml": " (jaxcal export, apply and compare read PLUS's calibration in it)",
+    **dict.fromkeys(
+        (".tfm", ".yaml", ".yml"), " (jaxcal export, apply and compare take it as CAL)"
+    ),
     ".png": " (name the folder of the PNG images)",
     ".dcm": " (--spacing-from reads its pixel size)",
     ".vtk": "",

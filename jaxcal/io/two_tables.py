@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxcal import InputError
 from jaxcal.io.frame_poses import tracking_of_table
-from jaxcal.io.poses_by_time import with_poses_by_time
+from jaxcal.io.poses_by_time import better_lag, with_poses_by_time
 from jaxcal.io.sequence import TrackedSequence
 from jaxcal.io.text import PoseTable
 from jaxcal.runtime.array_types import Bool, Float
@@ -62,6 +62,7 @@ def _poses_of(
 ) -> tuple[Float[np.ndarray, "n 4 4"], Bool[np.ndarray, " n"], list[str]]:
     """A pose for each point, whether it has one, and notes."""
     assert poses.poses is not None
+    assert points.points is not None
     for names in (_file_names, _frame_numbers):
         named, wanted = names(poses), names(points)
         if named is not None and wanted is not None:
@@ -75,9 +76,10 @@ def _poses_of(
         images = TrackedSequence(
             {}, {}, points.time, everywhere, source=points.name, clock=points.clock
         )
-        images, said = with_poses_by_time(images, tracking_of_table(poses, images))
+        tracking = tracking_of_table(poses, images)
+        images, said = with_poses_by_time(images, tracking)
         (found,), (valid,) = images.transforms.values(), images.valid.values()
-        return found, valid, said
+        return found, valid, said + better_lag(points.time, points.points, tracking, None)
     unnamed = points.file is None and points.frame is None and points.time is None
     if unnamed and len(poses) == len(points):
         return poses.poses, np.ones(len(points), bool), []
