@@ -161,7 +161,7 @@ class Calibration:
             noise; None if no distributions were compared.
         channel_sigma: SD of an element's distance, mm; None for solves on points.
         unknowns_covariance: covariance of all unknowns, in the order of ``blocks`` (mm, rad, log
-            units); NaN where X is not observable.
+            units); NaN where X is not observable or the solve failed.
         scale_mm_per_px: [lateral, axial], or None for points in mm.
         medium: sound speed and delay, or None where neither was estimated.
         rms: root mean square of ``residual``'s length over the used images, mm.
@@ -229,7 +229,7 @@ class Calibration:
 
     @property
     def covariance(self) -> Float[AnyArray, "*batch 6 6"]:
-        """Covariance of X (v mm, omega rad), other unknowns free; NaN where X is not observable."""
+        """Covariance of X (v mm, omega rad); NaN where that of all unknowns is."""
         return self.unknowns_covariance[..., :6, :6]
 
     @property
