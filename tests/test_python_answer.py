@@ -88,7 +88,10 @@ def test_batches_and_traces_print_without_a_verdict(recording):
     np.testing.assert_allclose(batch.image_to_probe[1], one.image_to_probe, atol=1e-9)
     assert [each.status for each in batch] == ["converged"] * 2
     assert len(batch) == len(list(batch)) == 2
-    assert all([one, batch, batch[:0]])
+    none = batch[:0]
+    assert all([one, batch, none])
+    assert none.residual.shape == (0, one.images_used, 3)
+    assert none.outlier.shape == none.elevation_sd.shape == (0, one.images_used)
     with pytest.raises(jaxcal.InputError, match="one calibration, not a batch"):
         list(one)
     with pytest.raises(jaxcal.InputError, match="one calibration, not a batch"):
