@@ -106,6 +106,24 @@ def test_batches_and_traces_print_without_a_verdict(recording):
     assert shapes._repr_html_() is None
 
 
+def test_values_are_values_inside_a_jit_too(recording, result):
+    """A jit traces the operators of JAX arrays that have values, and each of these calls ended in
+    JAX's traceback where the problem or the answer was no argument of the jit."""
+    problem = jaxcal.Problem.from_recording(recording)
+    assert isinstance(problem.sound_speed, jax.Array)
+    assert isinstance(result.status_code, jax.Array)
+    told, seen = str(result), []
+
+    def inside(x):
+        seen.append((bool(result.converged), int(result.images_used), result.warnings, str(result)))
+        seen.append(jaxcal.simulate_recording(jaxcal.Protocol(images=24, elevation_mm=1.0), 3))
+        return x * jaxcal.calibrate(problem, "conventional").rms
+
+    assert jax.eval_shape(inside, 2.0).shape == ()
+    assert seen[0] == (True, 24, result.warnings, told)
+    np.testing.assert_array_equal(seen[1].calibration.poses, recording.calibration.poses)
+
+
 def test_debuggers_and_lists_of_a_notebook_show_no_arrays(recording):
     """``repr`` says what a problem or a calibration is; its fields where it has no values."""
     pixels = jaxcal.make_images(

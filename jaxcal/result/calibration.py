@@ -218,14 +218,15 @@ class Calibration:
     @property
     def converged(self) -> Bool[AnyArray, "*batch"]:
         """Whether the solve converged and X is observable (traceable)."""
-        converged = self.status_code == Status.CONVERGED
-        return array_module(converged).asarray(converged)
+        # A JAX array's own operators trace inside a jit, even if the array has values.
+        xp = array_module(self.status_code)
+        return xp.asarray(xp.asarray(self.status_code) == Status.CONVERGED)
 
     @property
     def images_used(self) -> Int[AnyArray, "*batch"]:
         """Number of used images (traceable)."""
         xp = array_module(self.mask)
-        return xp.asarray(xp.sum(self.mask > 0, axis=-1))
+        return xp.asarray(xp.sum(xp.asarray(self.mask) > 0, axis=-1))
 
     @property
     def covariance(self) -> Float[AnyArray, "*batch 6 6"]:
@@ -440,7 +441,7 @@ class Calibration:
         """What a person should know before using this answer, in words (one problem)."""
         from jaxcal.diagnostics.warnings import warnings
 
-        return warnings(self)
+        return warnings(self.numpy())
 
     @property
     def observability(self) -> dict[str, float | str | None]:
