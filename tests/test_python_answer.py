@@ -88,7 +88,10 @@ def test_batches_and_traces_print_without_a_verdict(recording):
     np.testing.assert_allclose(batch.image_to_probe[1], one.image_to_probe, atol=1e-9)
     assert [each.status for each in batch] == ["converged"] * 2
     assert len(batch) == len(list(batch)) == 2
-    assert all([one, batch, batch[:0]])
+    none = batch[:0]
+    assert all([one, batch, none])
+    assert none.residual.shape == (0, one.images_used, 3)
+    assert none.outlier.shape == none.elevation_sd.shape == (0, one.images_used)
     with pytest.raises(jaxcal.InputError, match="one calibration, not a batch"):
         list(one)
     with pytest.raises(jaxcal.InputError, match="one calibration, not a batch"):
@@ -101,6 +104,24 @@ def test_batches_and_traces_print_without_a_verdict(recording):
     for other in (seen[0], str(shapes), str(jax.tree.map(np.shape, batch[0]))):
         assert other.startswith("Calibration(")
     assert shapes._repr_html_() is None
+
+
+def test_values_are_values_inside_a_jit_too(recording, result):
+    """A jit traces the operators of JAX arrays that have values, and each of these calls ended in
+    JAX's traceback where the problem or the answer was no argument of the jit."""
+    problem = jaxcal.Problem.from_recording(recording)
+    assert isinstance(problem.sound_speed, jax.Array)
+    assert isinstance(result.status_code, jax.Array)
+    told, seen = str(result), []
+
+    def inside(x):
+        seen.append((bool(result.converged), int(result.images_used), result.warnings, str(result)))
+        seen.append(jaxcal.simulate_recording(jaxcal.Protocol(images=24, elevation_mm=1.0), 3))
+        return x * jaxcal.calibrate(problem, "conventional").rms
+
+    assert jax.eval_shape(inside, 2.0).shape == ()
+    assert seen[0] == (True, 24, result.warnings, told)
+    np.testing.assert_array_equal(seen[1].calibration.poses, recording.calibration.poses)
 
 
 def test_debuggers_and_lists_of_a_notebook_show_no_arrays(recording):

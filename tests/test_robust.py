@@ -16,7 +16,7 @@ import jaxcal
 from jaxcal.cli.main import main
 from jaxcal.diagnostics.outliers import outlier_reasons, outliers
 from jaxcal.model.unknowns import RIGID
-from jaxcal.solvers.consensus import find_consensus, rigid_model
+from jaxcal.solvers.consensus import find_consensus, quantile, rigid_model
 
 with pytest.MonkeyPatch.context() as patch:
     patch.syspath_prepend(Path(__file__).parents[1] / "experiments")
@@ -65,6 +65,15 @@ def test_images_masked_by_the_caller_stay_out(consensus):
     found = consensus(replace(spoilt, mask=jnp.asarray(mask)))
     assert not np.asarray(found)[:, 20:30].any()
     np.testing.assert_array_equal(found, mask * (1 - np.asarray(outlier)))
+
+
+def test_a_median_moves_with_the_value_that_it_is():
+    """The SDs behind a pivot calibration's studentised errors moved with the largest error."""
+    values = jnp.array([3.0, jnp.nan, 0.5, 9.0, 1.5, 2.0, 1e3])
+    weight = jnp.array([1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.0])
+    found, slope = jax.jit(jax.value_and_grad(quantile))(values, weight, 0.5)
+    assert float(found) == pytest.approx(2.0, rel=1e-6)
+    np.testing.assert_array_equal(slope, [0, 0, 0, 0, 0, 1, 0])
 
 
 def test_exact_images_agree_at_another_sound_speed():

@@ -13,6 +13,8 @@ from jaxcal import InputError, Protocol, simulate
 from jaxcal.diagnostics.metrics import reconstruct
 from jaxcal.study.simulation import draw
 
+ROOT, SMALL = jax.random.key(7), Protocol(images=6, test_images=2)
+
 
 def test_truth_reconstructs_the_target():
     recording = experiment(0, images=30, elevation_mm=2.0, noise_mm=0.0)
@@ -27,19 +29,39 @@ def test_truth_reconstructs_the_target():
 
 
 def test_draws_do_not_depend_on_the_batch():
-    root, protocol = jax.random.key(7), Protocol(images=6, test_images=2)
-
-    def both(index):
-        key = jax.random.fold_in(root, index)
-        return draw(key, protocol), simulate(key, protocol)
-
-    batch = jax.jit(jax.vmap(both))
-    (many, whole), (one, part) = batch(jnp.arange(5)), batch(jnp.array([3]))
+    keys = jax.vmap(lambda index: jax.random.fold_in(ROOT, index))(jnp.arange(5))
+    batch = jax.jit(jax.vmap(lambda key: (draw(key, SMALL), simulate(key, SMALL))))
+    (many, whole), part = batch(keys), simulate(keys[3], SMALL)
+    one = jax.jit(lambda key: draw(key, SMALL))(keys[3])
     for name in ("turn", "position", "offset"):
-        np.testing.assert_array_equal(getattr(many, name)[3], getattr(one, name)[0])
+        np.testing.assert_array_equal(getattr(many, name)[3], getattr(one, name))
     # A program for another number of problems may round what follows differently.
-    np.testing.assert_allclose(whole.poses[3], part.poses[0], rtol=0, atol=1e-12 * 300)
-    np.testing.assert_allclose(whole.points[3], part.points[0], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(whole.poses[3], part.poses, rtol=0, atol=1e-12 * 300)
+    np.testing.assert_allclose(whole.points[3], part.points, rtol=0, atol=1e-6)
+
+
+def test_a_call_with_values_is_one_program_for_all_keys_and_sizes():
+    """It ran step by step: 279 programs for the first call, and one more for each other call."""
+    compiled = []
+
+    def listen(event: str, _: float, **__: str | int) -> None:
+        if "backend_compile" in event:
+            compiled.append(event)
+
+    first, second = jax.random.split(ROOT)
+    drawn = simulate(first, SMALL)
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        other = simulate(second, replace(SMALL, noise_mm=0.0, depth_mm=(20.0, 60.0)))
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+    assert compiled == []
+    np.testing.assert_array_equal(simulate(first, SMALL).points, drawn.points)
+    assert isinstance(drawn.points, jax.Array)
+    depth = np.linalg.norm(other.test_points, axis=1)
+    assert not other.covariance.any()
+    assert (depth > 20).all()
+    assert (other.test_points[:, 1] < 60).all()
 
 
 @pytest.mark.parametrize("count", [0, 1])

@@ -155,6 +155,8 @@ def test_batches_of_any_shape_and_bad_problems(solver):
     assert result.status.tolist() == expected
     assert result.image_to_probe.shape == (2, 3, 4, 4)
     assert np.isfinite(np.asarray(result.image_to_probe)[result.status == "converged"]).all()
+    # With three images predicted errors were 1e-12 mm.
+    assert np.isnan(np.asarray(result.covariance)[result.status == "failed"]).all()
     alone = jaxcal.calibrate(sound[2], **solver.arguments)
     third = jax.tree.map(lambda leaf: leaf[1, 1], result)
     assert_same(third, alone, solver.agreement)

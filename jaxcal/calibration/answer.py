@@ -123,8 +123,9 @@ def assemble(
         better = averaged.law.weighed[..., None, None] & jnp.isfinite(covariance)
         covariance = jnp.where(better, jnp.moveaxis(averaged.covariance, -1, 0), covariance)
     status = _status(iterate, convergence, observed, used)
-    known = (status != Status.UNOBSERVABLE)[..., None, None]
-    covariance = jnp.where(known, covariance, jnp.nan)
+    # Three images are fitted exactly, so what the residuals tell of the errors is nearly zero.
+    known = (status != Status.UNOBSERVABLE) & (status != Status.FAILED)
+    covariance = jnp.where(known[..., None, None], covariance, jnp.nan)
     if sigma is None:
         three_sigmas = _residual_sds(errors, elevation, blocks, bounded=bound is not None)
     elif plan.channels:

@@ -196,7 +196,8 @@ def _calibrated(problem: Problem, request: Request) -> Calibration:
 
         return solve_batch(problem, given, plan, None)
     check_values(problem)
-    if is_traced(problem, given):
+    # Under jit the answer is traced even if the problem is not.
+    if inside_transformation(problem, given):
         return replace(_solve_alone(problem, given, plan), problem=problem)
     joined, found = independent(problem, request.estimate)
     if found.images < MINIMUM_IMAGES:

@@ -60,7 +60,8 @@ class Pivot(eqx.Module):
     Attributes:
         tip: p in the tool's frame, mm.
         point: c in the tracker's frame, mm.
-        covariance: of (tip, point), mm^2; NaN where the poses do not determine them.
+        covariance: of (tip, point), mm^2; NaN where the poses do not determine them, or the solve
+            failed.
         sigma: SD of the error along one axis, mm.
         rms: root mean square length of the errors B_i p - c over the used poses, mm.
         residual: those errors in the tool's frame, mm; 0 where not used.
@@ -340,7 +341,7 @@ def _solve(poses: Float[Array, "n 4 4"], mask: Float[Array, " n"], *, robust: bo
     return Pivot(
         tip=parameters.translation,
         point=parameters.point,
-        covariance=jnp.where(unknown, jnp.nan, variance * inverse),
+        covariance=jnp.where(unknown | failed, jnp.nan, variance * inverse),
         sigma=jnp.sqrt(variance),
         rms=jnp.sqrt(jnp.sum(residual**2) / used),
         residual=residual,

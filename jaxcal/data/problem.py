@@ -523,7 +523,7 @@ def check_values(problem: Problem) -> None:
         value = getattr(problem, name)
         if value is not None and not np.isfinite(np.asarray(value)):
             raise InputError(f"{name} of the problem must be finite")
-    if problem.sound_speed is not None and problem.sound_speed != WATER_M_S:
+    if problem.sound_speed is not None and np.asarray(problem.sound_speed) != WATER_M_S:
         check_sound_speed(float(np.asarray(problem.sound_speed)))
     if problem.covariance is not None:
         checked_covariance(problem.covariance, len(used), used)

@@ -247,7 +247,7 @@ class ImageErrors:
             rows[..., column] = change
         weight = self.mask[..., None] * np.nan_to_num(np.asarray(channels.heard))
         rows = np.where(weight[..., None] > 0, rows, 0.0) * weight[..., None]
-        return rows.reshape(len(rows), -1, rows.shape[-1])
+        return flattened(rows)
 
 
 @dataclass(frozen=True)
@@ -303,8 +303,7 @@ class Whitened:
         if self.offset_rows is not None:
             rows = rows - self.offset_rows[..., None] * self.offset_response[:, :, None]
             own = self.offset_rows**2 / self.offset_precision[..., None]
-        flat = rows.reshape(len(rows), -1, rows.shape[-1])
-        return quadratic(flat, inverse).reshape(rows.shape[:-1]) + own
+        return quadratic(flattened(rows), inverse).reshape(rows.shape[:-1]) + own
 
 
 def error_sd(answer: Calibration) -> Float[AnyArray, "*batch 3"]:
@@ -393,6 +392,11 @@ def _decorrelated(
     lateral = values[..., 0, :] / first
     distance = (values[..., 1, :] - mixed * lateral) / second
     return np.stack([lateral, distance, values[..., 2, :]], axis=-2)
+
+
+def flattened(rows: Float[Array, "k n m p"]) -> Float[Array, "k nm p"]:
+    """Rows of all images one after the other; also for no problems, where -1 is ambiguous."""
+    return rows.reshape(len(rows), rows.shape[1] * rows.shape[2], rows.shape[3])
 
 
 def quadratic(rows: Float[Array, "k m p"], matrix: Float[Array, "k p p"]) -> Float[Array, "k m"]:

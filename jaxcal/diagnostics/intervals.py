@@ -196,7 +196,7 @@ def predicted_tre(
         points: [lateral, axial] in the image plane, mm; any shape, a grid for a map.
 
     Returns:
-        (*batch, *points) mm; NaN where X is not observable.
+        (*batch, *points) mm; NaN where X is not observable or the solve failed.
 
     Raises:
         InputError: points of another shape, or (if they are not traced) NaN or Inf.
@@ -254,7 +254,7 @@ def tre_at(calibration: Calibration, points: Float[np.ndarray, "*points 2"]) -> 
         points: [lateral, axial] in the image plane, mm.
 
     Returns:
-        Arrays of shape (*batch, *points); NaN where X is not observable.
+        Arrays of shape (*batch, *points); NaN where X is not observable or the solve failed.
 
     Raises:
         InputError: points of another shape, NaN or Inf.

@@ -29,6 +29,7 @@ from jaxcal.diagnostics.image_errors import (
     ImageErrors,
     Whitened,
     error_sd,
+    flattened,
     motion,
     own_covariance,
     quadratic,
@@ -122,7 +123,7 @@ def studentised_errors(
     errors, rows = seen.errors / by, seen.rows[..., columns] / by[..., None]
 
     sigma = robust_sd(medians(np.abs(errors), kept), kept.sum(axis=1), len(columns))
-    rows = (rows / sigma[:, None, :, None]).reshape(len(rows), -1, len(columns))
+    rows = flattened(rows / sigma[:, None, :, None])
     used = rows * np.repeat(kept, 3, axis=1)[..., None]
     inverse = inverses(np.swapaxes(used, 1, 2) @ used, eps)
     leverage = quadratic(rows, inverse).reshape(errors.shape)

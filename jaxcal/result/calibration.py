@@ -161,7 +161,7 @@ class Calibration:
             noise; None if no distributions were compared.
         channel_sigma: SD of an element's distance, mm; None for solves on points.
         unknowns_covariance: covariance of all unknowns, in the order of ``blocks`` (mm, rad, log
-            units); NaN where X is not observable.
+            units); NaN where X is not observable or the solve failed.
         scale_mm_per_px: [lateral, axial], or None for points in mm.
         medium: sound speed and delay, or None where neither was estimated.
         rms: root mean square of ``residual``'s length over the used images, mm.
@@ -218,18 +218,19 @@ class Calibration:
     @property
     def converged(self) -> Bool[AnyArray, "*batch"]:
         """Whether the solve converged and X is observable (traceable)."""
-        converged = self.status_code == Status.CONVERGED
-        return array_module(converged).asarray(converged)
+        # A JAX array's own operators trace inside a jit, even if the array has values.
+        xp = array_module(self.status_code)
+        return xp.asarray(xp.asarray(self.status_code) == Status.CONVERGED)
 
     @property
     def images_used(self) -> Int[AnyArray, "*batch"]:
         """Number of used images (traceable)."""
         xp = array_module(self.mask)
-        return xp.asarray(xp.sum(self.mask > 0, axis=-1))
+        return xp.asarray(xp.sum(xp.asarray(self.mask) > 0, axis=-1))
 
     @property
     def covariance(self) -> Float[AnyArray, "*batch 6 6"]:
-        """Covariance of X (v mm, omega rad), other unknowns free; NaN where X is not observable."""
+        """Covariance of X (v mm, omega rad); NaN where that of all unknowns is."""
         return self.unknowns_covariance[..., :6, :6]
 
     @property
@@ -440,7 +441,7 @@ class Calibration:
         """What a person should know before using this answer, in words (one problem)."""
         from jaxcal.diagnostics.warnings import warnings
 
-        return warnings(self)
+        return warnings(self.numpy())
 
     @property
     def observability(self) -> dict[str, float | str | None]:

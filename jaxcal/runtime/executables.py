@@ -119,7 +119,8 @@ class _Program:
     from_disk: bool
 
     def __call__(self, leaves: list[Any], convert: Convert) -> Any:
-        arrays = jax.device_put(leaves, self.device)
+        with jax.ensure_compile_time_eval():  # inside a caller's jit it would trace
+            arrays = jax.device_put(leaves, self.device)
         pieces = self.executable.execute_sharded(arrays).disassemble_into_single_device_arrays()
         return rebuild(
             self.result, convert(jax.block_until_ready([shards[0] for shards in pieces]))

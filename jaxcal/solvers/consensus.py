@@ -44,6 +44,7 @@ from jaxcal.model.parameters import Parameters, retract
 from jaxcal.model.residuals import measured_points, measurement_residual
 from jaxcal.model.thresholds import FEWEST_IMAGES
 from jaxcal.model.unknowns import Blocks, count_unknowns
+from jaxcal.runtime.jax_modes import in_standard_promotion
 from jaxcal.solvers import dense
 from jaxcal.solvers.proposals import SUBSET, linear_proposals, nominal, subset_weights
 
@@ -279,12 +280,14 @@ def _medians(
     return jax.vmap(quantile, (1, None, None))(jnp.abs(errors), weight, 0.5)
 
 
+@jax.custom_jvp
 def quantile(
     values: Float[Array, " n"], weight: Float[Array, " n"], share: float | Float[Array, ""]
 ) -> Float[Array, ""]:
     """The least value that at least ``share`` of the weight does not exceed, by bisection.
 
-    Sorting many short rows is slow on every backend; counting is not. NaN counts as infinite.
+    Sorting many short rows is slow on every backend; counting is not. NaN counts as infinite. The
+    derivative is that of this value; bisection alone would have the derivative of the largest one.
     """
     values = jnp.where(jnp.isnan(values), jnp.inf, values)
     wanted = share * jnp.sum(weight)
@@ -300,3 +303,13 @@ def quantile(
 
     found = jax.lax.fori_loop(0, HALVINGS, halve, (jnp.zeros_like(high), high))[1]
     return jnp.where(jnp.sum(weight * (values <= high)) >= wanted, found, jnp.inf)
+
+
+@quantile.defjvp
+@in_standard_promotion
+def _quantile_jvp(primals: tuple, tangents: tuple) -> tuple:
+    values, weight, _ = primals
+    found = quantile(*primals)
+    counted = (weight > 0) & jnp.isfinite(values)
+    away = jnp.where(counted, jnp.abs(values - found), jnp.inf)
+    return found, tangents[0][jnp.argmin(away)]

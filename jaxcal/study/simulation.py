@@ -34,7 +34,7 @@ from jaxcal.data.segmentation.time_of_flight import fit_in_plane
 from jaxcal.model import unrolled
 from jaxcal.runtime import executables
 from jaxcal.runtime.arrays import is_traced
-from jaxcal.runtime.compiler import ONE_PROBLEM, computed_once
+from jaxcal.runtime.compiler import ONE_PROBLEM, compiled, computed_once
 from jaxcal.runtime.given_values import (
     LARGEST_SEED,
     check_flag,
@@ -43,7 +43,7 @@ from jaxcal.runtime.given_values import (
     is_number,
     whole_number,
 )
-from jaxcal.runtime.jax_modes import in_own_modes, require_float64
+from jaxcal.runtime.jax_modes import in_own_modes, inside_transformation, require_float64
 from jaxcal.runtime.messages import shown
 from jaxcal.study import draws
 from jaxcal.study.laws import LawName, check_law
@@ -241,7 +241,7 @@ class Planes(eqx.Module):
 
 @in_own_modes
 def simulate(key: Key[Array, ""], protocol: Protocol) -> Experiment:
-    """Draw one experiment; vmap over keys for a batch.
+    """Draw one experiment; ``jax.jit(jax.vmap(...))`` over keys for a batch.
 
     Args:
         key: a JAX key; for trial k of a study ``jax.random.fold_in(root, k)``, so that draws do not
@@ -254,6 +254,16 @@ def simulate(key: Key[Array, ""], protocol: Protocol) -> Experiment:
     require_float64("jaxcal.simulate")
     check_key("key", key)
     check_made("protocol", protocol, Protocol, "jaxcal.Protocol")
+    if inside_transformation(key, vars(protocol)):
+        return _simulated(key, protocol)
+    # Step by step it would be several hundred programs, and one more in every call.
+    shape, numbers = split_protocol(protocol)
+    program = compiled(_from_numbers, 2, next(iter(key.devices())).platform)
+    return program(key, tuple(numbers.values()), shape)
+
+
+def _simulated(key: Key[Array, ""], protocol: Protocol) -> Experiment:
+    """Draw one experiment (traceable)."""
     numbers, noise = draw(key, protocol), draw_noise(key, protocol)
     planes = arrange(numbers, protocol)
     distances = _distances(planes, noise, protocol)
@@ -479,15 +489,20 @@ def _drawn(seed: int, protocol: Protocol) -> Experiment:
     shape, numbers = split_protocol(protocol)
     arguments = (np.asarray(seed, np.int64), tuple(numbers.values()))
     if executables.processor() is None:
-        return jax.jit(_from_numbers, static_argnums=2)(*arguments, shape)
+        return jax.jit(_from_seed, static_argnums=2)(*arguments, shape)
     label = {"method": "simulation", "images": protocol.images}
-    return executables.run(_from_numbers, arguments, shape, flags=ONE_PROBLEM, label=label)
+    return executables.run(_from_seed, arguments, shape, flags=ONE_PROBLEM, label=label)
 
 
-def _from_numbers(seed: Int[Array, ""], sizes: tuple[Array, ...], shape: Protocol) -> Experiment:
+def _from_seed(seed: Int[Array, ""], sizes: tuple[Array, ...], shape: Protocol) -> Experiment:
     """Draw an experiment of a protocol whose numbers are traced."""
+    return _from_numbers(jax.random.key(seed), sizes, shape)
+
+
+def _from_numbers(key: Key[Array, ""], sizes: tuple[Array, ...], shape: Protocol) -> Experiment:
+    """:func:`_from_seed` by a key."""
     numbers = dict(zip(NUMBERS, sizes, strict=False))  # a perfect tracker has no sizes
-    return simulate(jax.random.key(seed), join_protocol(shape, numbers))
+    return _simulated(key, join_protocol(shape, numbers))
 
 
 @in_own_modes
