@@ -64,8 +64,9 @@ SETTINGS: dict[str, tuple[str, ...]] = {
         "outside a 99 % interval",
         "with 4 to 20 poses",
         "250 clean recordings for each of three distributions and 30, 54 and 200 images",
-        "1000 clean recordings each of 12, 30 and 60 images, and 200 each with one of nine faults",
+        "1000 clean recordings each of 12, 30 and 60 images, and 200 each with one of ten faults",
         "ranges 4 % too long",
+        "lateral positions 4 % too long",
         "200 recordings each of 12, 30 and 60 images, with uniform offsets up to 1 mm or normal "
         "or heavy-tailed ones with an SD of 1 mm, calibrated with `--prior bounded` and a bound of "
         "0.25 to 4 mm",
