@@ -815,6 +815,13 @@ def test_points_outside_the_frames(tmp_path, capsys):
         joined(jaxcal.Recording(images), jaxcal.Recording(other))
     bare = jaxcal.Recording(replace(images, frame_size=None))
     assert joined(bare, jaxcal.Recording(images)).calibration.frame_size == (640, 480)
+    # Also where only one of the two states its frames; the command named its output as the culprit.
+    narrow = jaxcal.Recording(replace(images, frame_size=(60, 480)), source="narrow.h5")
+    bare = replace(bare, source="bare.h5")
+    for pair in ((bare, narrow), (narrow, bare)):
+        told = rf"{pair[1].source} cannot be added to {pair[0].source}: bare\.h5: pixel 0, u = "
+        with pytest.raises(InputError, match=told):
+            joined(*pair)
 
 
 def test_points_off_the_plane(tmp_path, sequence):
