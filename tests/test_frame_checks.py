@@ -250,7 +250,7 @@ def test_the_verdict_is_do_not_use_and_the_exit_status_says_so(slips):
             assert (record[part] is None) is (named or part == "comparison")
         if named:
             assert result.wrong_frames in result.warnings
-            assert "invert them" in lines[0]
+            assert "invert them, or import with --invert-poses" in lines[0]
             # Said once, and nobody is sent to take further images.
             assert sum("invert them" in line for line in lines) == 1
             assert not any("Add images" in line or "tilted" in line for line in lines[-2:])

@@ -233,10 +233,10 @@ def test_segment_and_pick_read_tables_of_poses_as_import_does(tmp_path, folder, 
     ):
         assert main([*command, *poses]) == 2
         assert "leave such rows out with --skip-invalid" in capsys.readouterr().err
-    given = ["--pose-units", "m", "--quaternion", "wxyz", "--skip-invalid"]
+    given = ["--pose-units", "m", "--quaternion", "wxyz", "--skip-invalid", "--invert-poses"]
     assert main(["segment", str(folder), *poses, *given]) == 0
     images = jaxcal.load(tmp_path / "images-segmented.h5").calibration
-    assert images.poses[0, :3, 3] == pytest.approx([100, 50, 0])
+    assert images.poses[0, :3, 3] == pytest.approx([-100, -50, 0])
     assert main(["pick", str(folder), str(tmp_path / "no" / "p.csv"), *poses, *given]) == 2
     assert "its folder does not exist" in capsys.readouterr().err
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import jax
 import numpy as np
@@ -262,5 +263,11 @@ def test_poses_of_a_tool_are_read_from_sequences_and_tables(tmp_path):
     table.write_text("\n".join(lines))
     read, _ = tool_poses(table, ImportOptions(quaternion="wxyz", pose_units="m"))
     np.testing.assert_allclose(read, poses, atol=1e-9)
+    for each in (file, table):
+        asked = ImportOptions(quaternion=None if each == file else "wxyz", pose_units="mm")
+        (plain, _), (back, _) = (
+            tool_poses(each, replace(asked, invert_poses=turned)) for turned in (False, True)
+        )
+        np.testing.assert_allclose(back @ plain, np.tile(np.eye(4), (len(plain), 1, 1)), atol=1e-9)
     with pytest.raises(InputError, match="--from is for sequences"):
         tool_poses(table, ImportOptions(source="Stylus"))

@@ -781,17 +781,17 @@ def test_apply_tells_that_the_verdict_expects_more_than_the_covariance_says(tmp_
 
 
 def test_apply_refuses_options_of_a_table_where_none_is_read(saved, tmp_path, capsys):
-    rest = ["--pose-units", "m", "--quaternion", "wxyz", "--skip-invalid"]
+    rest = ["--pose-units", "m", "--quaternion", "wxyz", "--skip-invalid", "--invert-poses"]
     for source in (["--pixel", "1", "2"], [str(tmp_path / "rec.h5")]):
         assert main(["apply", str(saved), *source, *rest]) == 2
-        told = "--pose-units, --quaternion, --skip-invalid: for tables, but no table is read"
+        told = "--skip-invalid, --invert-poses: for tables, but no table is read"
         assert told in capsys.readouterr().err
 
 
 def test_apply_refuses_options_of_poses_where_a_table_has_none(saved, tmp_path, capsys):
     uv = tmp_path / "uv.csv"
     uv.write_text("u,v\n1,2\n")
-    for given in (["--quaternion", "wxyz"], ["--pose-units", "m"]):
+    for given in (["--quaternion", "wxyz"], ["--pose-units", "m"], ["--invert-poses"]):
         assert main(["apply", str(saved), str(uv), *given]) == 2
         assert f"{given[0]}: for poses, but {uv} holds none" in capsys.readouterr().err
     assert main(["apply", str(saved), str(uv), "--skip-invalid"]) == 0

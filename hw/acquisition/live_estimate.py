@@ -110,7 +110,8 @@ class Estimator:
         """The state of the acquisition after an image, for a person."""
         bracket = placement.bracket
         placed = (
-            f"image {self.count}/{total}: offset {bracket.centre_mm:+.2f} mm in "
+            f"image {self.count - 1} ({self.count} of {total}): "
+            f"offset {bracket.centre_mm:+.2f} mm in "
             f"[{bracket.low_mm:+.2f}, {bracket.high_mm:+.2f}], {placement.moves} moves"
         )
         head = "; ".join([placed, *placement.notes])

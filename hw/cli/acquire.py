@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
-from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +15,7 @@ from hw.cli.common import (
     bench_seed_option,
     check_resumed,
     controller_option,
+    recording_path,
     setup_of,
     setup_option,
     speed_option,
@@ -149,7 +149,7 @@ def acquire(
     phantom, operator = request.phantom, request.operator
     controller = controller or request.controller
     _check_installed(phantom, bench, move)
-    path = recording or f"acquisition-{datetime.now():%Y%m%d-%H%M%S}.h5"
+    path = recording_path(recording, "acquisition", resume)
 
     prepare_jax()
     with ExitStack() as stack:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
+from datetime import datetime
 from typing import TYPE_CHECKING
 
 import click
@@ -11,6 +12,7 @@ from click.core import ParameterSource
 from hw.runtime.choices import CONTROLLERS, PHANTOMS
 from jaxcal import InputError
 from jaxcal.cli.common import POSITIVE
+from jaxcal.io.outputs import RECORDING
 
 if TYPE_CHECKING:
     from hw.bench.run import Bench
@@ -37,6 +39,24 @@ bench_seed_option = click.option(
     metavar="N",
     help="Emulated bench: seed of the simulated world.",
 )
+
+
+def recording_path(recording: str | None, default: str, resume: bool) -> str:
+    """The file of a run: named after the time by default; a new one is named as recordings are.
+
+    Args:
+        recording: as the person named it; with ``resume`` not None.
+        default: how a name begins that nobody gave.
+        resume: whether the file is there, whatever its name.
+
+    Raises:
+        InputError: a name that hides from other programs, and from people, what is in the file.
+    """
+    if recording is None:
+        return f"{default}-{datetime.now():%Y%m%d-%H%M%S}.h5"
+    if not resume and not recording.lower().endswith(RECORDING):
+        raise InputError(f"{recording}: a recording is named {' or '.join(RECORDING)}")
+    return recording
 
 
 def check_resumed(recording: str | None, *allowed: str) -> None:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import sys
-from datetime import datetime
 from typing import Any
 
 import click
 
-from hw.cli.common import check_resumed
+from hw.cli.common import check_resumed, recording_path
 from hw.runtime.choices import HAND_PLACEMENTS
 from jaxcal import InputError
 from jaxcal.cli.common import Server, prepare_jax, verdict_code
@@ -102,7 +101,7 @@ def free_hand(
                 raise InputError(
                     f"{name} is for segmented images; it cannot be used with pattern-injection"
                 )
-    path = recording or f"free-hand-{datetime.now():%Y%m%d-%H%M%S}.h5"
+    path = recording_path(recording, "free-hand", resume)
     rules = Rules(target="cross" if target == "cross" else "echo", region=region)
     asked = FreeHand(*server, rules=rules, **options)
     from hw.midplane.terminal_image import Screen

@@ -113,10 +113,9 @@ class _Run(Run):
         self.recorder.add_pixel(taken.pose, taken.pixel, taken.covariance, taken.time)
         self.kept.add(taken.pose)
         # The frame is on the disk; keeping all of them would fill the memory.
-        self.guide.keep(replace(taken, posed=None))
-        count = len(self.kept)
+        self.guide.keep(replace(taken, posed=None, row=self.kept.rows[-1]))
         at = f"{taken.pixel[0]:.1f}, {taken.pixel[1]:.1f}"
-        self.person.say(f"image {count}/{self.asked.images}: target at {at} px{self._estimate()}")
+        self.person.say(f"{self.last_image()}: target at {at} px{self._estimate()}")
 
     def _check_spacing(self, now: tuple[float, float]) -> None:
         """Refuse an image of another depth: its pixels do not fit together with those before.
@@ -160,7 +159,7 @@ class _Run(Run):
         text = f"; the images agree to {float(answer.rms):.2f} mm"
         worst = int(np.argmax(residual))
         if residual[worst] > max(_STANDS_OUT * float(np.median(residual)), _LEAST_MM):
-            text += f"; image {worst + 1} stands out by {residual[worst]:.1f} mm"
+            text += f"; image {taken[worst].row} stands out by {residual[worst]:.1f} mm"
             if worst == len(taken) - 1:
                 text += " (u removes it)"
         return text
@@ -197,6 +196,7 @@ def _resumed(path: str | os.PathLike[str], asked: FreeHand) -> tuple[Guide, Kept
             columns["pixel"][row],
             columns["covariance"][row],
             float(columns["time"][row]),
+            row=row,
         )
         for row in kept.rows
     ]

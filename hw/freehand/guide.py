@@ -68,6 +68,7 @@ class Taken:
         covariance: (2, 2), px^2.
         time: s.
         posed: the frame in the middle of that moment.
+        row: its number in the recording, once it is there.
     """
 
     pose: Float[np.ndarray, "4 4"]
@@ -75,6 +76,7 @@ class Taken:
     covariance: Float[np.ndarray, "2 2"]
     time: float
     posed: PosedImage | None = None
+    row: int | None = None
 
 
 @dataclass(frozen=True)
@@ -168,13 +170,13 @@ class Guide:
         same = self._like(pose, pixel, frame.shape)
         if same is not None:
             return Look(
-                f"as in image {same + 1}: turn the probe, or bring the target elsewhere in the "
+                f"as in image {same.row}: turn the probe, or bring the target elsewhere in the "
                 "image"
             )
-        for index, other in enumerate(self.taken):
+        for other in self.taken:
             if self._still(np.array([other.pose, pose])):
                 return Look(
-                    f"the pose is that of image {index + 1}, but the target is elsewhere in the "
+                    f"the pose is that of image {other.row}, but the target is elsewhere in the "
                     "image: is the tracker frozen, or was the target moved?"
                 )
         if self._moves(pixel, frame.shape):
@@ -200,13 +202,13 @@ class Guide:
         shift, turn = spread_of(poses)
         return shift <= self.rules.still_mm and turn <= self.rules.still_deg
 
-    def _like(self, pose: np.ndarray, pixel: np.ndarray, shape: tuple[int, ...]) -> int | None:
+    def _like(self, pose: np.ndarray, pixel: np.ndarray, shape: tuple[int, ...]) -> Taken | None:
         """The image that this one does not differ from."""
-        for index, other in enumerate(self.taken):
+        for other in self.taken:
             moved = np.abs(pixel - other.pixel) / [shape[1], shape[0]]
             near = np.max(moved) < self.rules.different_part
             if near and turn_deg(other.pose, pose) < self.rules.different_deg:
-                return index
+                return other
         return None
 
     def advice(self, size: tuple[int, int]) -> str:

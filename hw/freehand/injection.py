@@ -305,7 +305,8 @@ class _Run(Run):
             return
         self._shown = now
         frame = self._images[-1].image.array
-        title = f"image {len(self.kept) + 1} of {self.asked.images}"
+        kept = self.kept
+        title = f"image {kept.next_row} ({len(kept) + 1} of {self.asked.images})"
         view = self._view()
         late = ""
         late_s = self._images[-1].image.late_s
@@ -394,7 +395,7 @@ class _Run(Run):
         )
         self.kept.add(pose)
         self.person.say(
-            f"image {len(self.kept)}/{self.asked.images}: offset {bracket.centre_mm:+.2f} in "
+            f"{self.last_image()}: offset {bracket.centre_mm:+.2f} in "
             f"[{bracket.low_mm:+.2f}, {bracket.high_mm:+.2f}] mm"
         )
         self._new_sweep()

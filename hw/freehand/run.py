@@ -104,6 +104,10 @@ class Run(ABC):
         state = f"{reason}; {len(self.kept)} of {asked.images} images are in {path}"
         raise FreeHandStopped(f"{state}; go on with: {again}", interrupted=interrupted)
 
+    def last_image(self) -> str:
+        """The last image that counts: its number in the recording, and how many there are."""
+        return f"image {self.kept.rows[-1]} ({len(self.kept)} of {self.asked.images})"
+
     def _go(self) -> int:
         self.begin()
         self.note("started", f"{self.asked.images - len(self.kept)} images to take")

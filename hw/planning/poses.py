@@ -88,7 +88,7 @@ class PosePlan:
 
     Attributes:
         poses: (n, 4, 4) tool centre point -> base, mm.
-        expected: (n, 2) where the target should then be in the image: [lateral, range], mm.
+        expected: (n, 2) where the target should then be in the image: [lateral, depth], mm.
         scene: the scene that it was made for.
         passed_over: poses of the sequence that left the box or the reach.
     """
@@ -234,6 +234,7 @@ def preview(plan: PosePlan, path: Path, box_mm: Float[np.ndarray, "2 3"] | None 
         OutputError: it cannot be written.
     """
     from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
 
     figure = Figure(figsize=(12, 4), layout="constrained")
     room = figure.add_subplot(1, 3, 1, projection="3d")
@@ -261,14 +262,16 @@ def preview(plan: PosePlan, path: Path, box_mm: Float[np.ndarray, "2 3"] | None 
     cone = figure.add_subplot(1, 3, 2, projection="polar")
     first, second, along = (axial @ looking_rotation(plan.scene.looking)).T
     tilt = np.degrees(np.arccos(np.clip(along, -1, 1)))
-    cone.scatter(np.arctan2(second, first), tilt, c=np.arange(len(plan)), s=16)
+    number = np.arange(1, len(plan) + 1)
+    cone.scatter(np.arctan2(second, first), tilt, c=number, s=16)
     cone.set_title("axial direction: tilt (degrees)", pad=18)
 
     image = figure.add_subplot(1, 3, 3)
-    dots = image.scatter(*plan.expected.T, c=np.arange(len(plan)), s=16)
-    figure.colorbar(dots, ax=image, label="pose, in the order of the plan")
+    dots = image.scatter(*plan.expected.T, c=number, s=16)
+    whole = MaxNLocator(integer=True)
+    figure.colorbar(dots, ax=image, label="pose, in the order of the plan", ticks=whole)
     image.set(
-        xlabel="lateral (mm)", ylabel="range (mm)", title="target in the image", aspect="equal"
+        xlabel="lateral (mm)", ylabel="depth (mm)", title="target in the image", aspect="equal"
     )
     image.invert_yaxis()
     save_figure(figure, path, dpi=130.0)

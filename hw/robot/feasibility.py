@@ -263,15 +263,15 @@ def _follow_branch(
     stage = 0
     try:
         if np.isnan(first).any():
-            raise refused(f"pose 0 of the plan is out of the reach of a {arm.model.name}")
-        here = follow(arm, poses[0], poses[0], nearest_turn(first, reference), "pose 0 of the plan")
+            raise refused(f"pose 1 of the plan is out of the reach of a {arm.model.name}")
+        here = follow(arm, poses[0], poses[0], nearest_turn(first, reference), "pose 1 of the plan")
         path, dexterity, speed = [here.joints[-1]], here.dexterity_mm, 0.0
         for stage in range(1, len(poses)):
-            at = f"pose {stage} of the plan"
+            at = f"pose {stage + 1} of the plan"
             flange = flange_of(poses[stage], arm.tcp_offset)
             if not inverse(arm.model, flange).reached[here.branch]:
                 raise refused(f"{at} is out of the reach of a {arm.model.name}")
-            what = f"the way from pose {stage - 1} to pose {stage}"
+            what = f"the way from pose {stage} to pose {stage + 1}"
             duration = float(durations_s[stage - 1])
             course = follow(arm, poses[stage - 1], poses[stage], path[-1], what, duration)
             path.append(course.joints[-1])

@@ -39,7 +39,7 @@ def check_plan(plan: MotionPlan) -> Course | None:
     """
     previous, durations = None, []
     _check_box_in_reach(plan)
-    for k, target in enumerate(plan.targets):
+    for k, target in enumerate(plan.targets, start=1):
         pose = checked_pose(target, f"pose {k} of the plan")
         check_path(plan, pose, pose, f"pose {k} of the plan")
         if previous is not None:

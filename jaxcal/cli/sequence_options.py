@@ -95,8 +95,13 @@ TABLES = (
         is_flag=True,
         help="Leave out rows of tables that are marked as invalid, have gaps or a pose of zeros.",
     ),
+    click.option(
+        "--invert-poses",
+        is_flag=True,
+        help="The file's poses are from the tracker to the probe (or tool): take their inverses.",
+    ),
 )
-"""How tables of poses are read."""
+"""How poses, and tables of them, are read."""
 spacing_option = click.option(
     "--spacing",
     "spacing_mm",
@@ -161,7 +166,8 @@ def given_options(options: dict[str, Any], *, orientation: bool = False) -> list
         # Nothing is estimated where points are yet to be placed.
         if options[key] and options[key] != "auto":
             stated += [f"--{name}", f"{options[key]}"]
-    return stated + ["--skip-invalid"] * options["skip_invalid"]
+    flags = [("--skip-invalid", "skip_invalid"), ("--invert-poses", "invert_poses")]
+    return stated + [flag for flag, key in flags if options[key]]
 
 
 def by_hand(source: str, found: FrameResults, options: dict[str, Any]) -> list[str]:

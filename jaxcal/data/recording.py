@@ -250,6 +250,13 @@ def joined(first: Recording, second: Recording) -> Recording:
         # Of another depth or cut: a pixel's size or origin is another one, too.
         told = ", not ".join("{} x {}".format(*size) for size in (b.frame_size, a.frame_size))
         raise InputError(f"{where}: its frames have {told} px")
+    for each, other in ((first, b), (second, a)):
+        if other.frame_size and each.calibration.frame_size is None:
+            try:
+                held = each.calibration
+                _check_inside(held.measurements, other.frame_size, held.mask)
+            except InputError as error:
+                raise InputError(f"{where}: {each.source}: {error}") from None
     if None not in (first.probe, second.probe) and first.probe != second.probe:
         raise InputError(f"{where}: their probes differ")
     frames = [each.pose_frames for each in (first, second)]

@@ -271,7 +271,7 @@ def _slips(data: ImageData) -> Iterator[tuple[str, dict[str, np.ndarray]]]:
     turned = np.swapaxes(rotations, 1, 2)
     back = -np.einsum("nij,nj->ni", turned, shifts)
     yield (
-        "the poses are from the tracker to the probe: invert them",
+        "the poses are from the tracker to the probe: invert them, or import with --invert-poses",
         {"rotations": turned, "translations": back},
     )
     yield (

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from jaxcal import InputError
+from jaxcal.data.poses import inverse_poses
 from jaxcal.io.folder import PROBE_TO_TRACKER, with_pose_table
 from jaxcal.io.frame_names import FramePair, capitalised
 from jaxcal.io.poses_by_time import times_of_table, with_poses_by_time
@@ -65,6 +66,7 @@ def opened(
     tracking = read_tracked(options.poses, options.pose_units)
     start, end, said = _frames(tracking, options)
     poses, valid = tracking.poses(start, end)
+    poses = inverse_poses(poses) if options.invert_poses else poses
     pair = start, end
     return sequence, replace(tracking, transforms={pair: poses}, valid={pair: valid}), said
 
@@ -99,9 +101,11 @@ def tracked_poses(
     if options.poses is None:
         start, end, notes = _frames(sequence, options)
     else:
-        # The assumptions were noted when the poses were matched.
+        # The assumptions were noted, and poses inverted, when the poses were matched.
         (start, end), notes = next(iter(sequence.transforms)), []
     poses, valid = sequence.poses(start, end)
+    if options.invert_poses and options.poses is None:
+        poses = inverse_poses(poses)
     lost = len(sequence) - int(valid.sum())
     if lost and options.poses is None:
         notes.append(f"{lost} of {len(sequence)} frames left out: their tracking was not OK")
@@ -133,8 +137,13 @@ def tool_poses(
     refuse(options, ("source", "target"), "is for sequences and trackers' exports, not for a table")
     if not first_line(source)[1]:
         refuse(options, ("skip_invalid",), "is for tables with a header")
-        quaternion, unit = options.quaternion or "xyzw", options.pose_units or "mm"
-        return read_poses(source, quaternion=quaternion, pose_units=unit), []
+        poses = read_poses(
+            source,
+            quaternion=options.quaternion or "xyzw",
+            pose_units=options.pose_units or "mm",
+            invert_poses=options.invert_poses,
+        )
+        return poses, []
     table = read_rows(source, options, ignore_time=True)
     if table.poses is None:
         raise InputError(f"{table.name}: holds no poses")

@@ -89,6 +89,7 @@ def import_files(
                 *sources,
                 spacing_mm=options.spacing_mm,
                 pose_units=options.pose_units or "mm",
+                invert_poses=options.invert_poses,
                 minimum=options.minimum,
             )
         return Imported(pair, [])

@@ -36,6 +36,7 @@ class ImportOptions:
         quaternion: where a quaternion's scalar stands.
         pose_units: of translations where the file of the poses does not say; mm by default.
         skip_invalid: leave out rows of tables that are marked as invalid, and count them.
+        invert_poses: the file's poses are tracker -> probe, and their inverses are taken.
         points: how points without time or number are assigned to frames.
         target_kind: what to look for in frames where no points are given: ``echo``, the default,
             or ``cross``.
@@ -57,6 +58,7 @@ class ImportOptions:
     quaternion: QuaternionOrder | None = None
     pose_units: LengthUnit | None = None
     skip_invalid: bool = False
+    invert_poses: bool = False
     points: Assignment | None = None
     target_kind: Literal["echo", "cross"] | None = None
     region: tuple[int, int, int, int] | None = None
@@ -137,6 +139,7 @@ def read_rows(
         pose_units=options.pose_units,
         units=options.units,
         skip_invalid=options.skip_invalid,
+        invert_poses=options.invert_poses,
         ignore_time=ignore_time,
     )
 

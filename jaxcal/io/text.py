@@ -14,7 +14,12 @@ from typing import Literal
 import numpy as np
 
 from jaxcal import FormatError, InputError
-from jaxcal.data.poses import QuaternionOrder, check_poses, rotations_from_quaternions
+from jaxcal.data.poses import (
+    QuaternionOrder,
+    check_poses,
+    inverse_poses,
+    rotations_from_quaternions,
+)
 from jaxcal.data.recording import MINIMUM_IMAGES, Recording, make_images
 from jaxcal.io.columns import CONVERT, LENGTHS_MM, Columns, LengthUnit, columns_of_header
 from jaxcal.io.given_files import naming
@@ -96,6 +101,7 @@ def read_pose_table(
     pose_units: LengthUnit | None = None,
     units: Literal["px", "mm"] | None = None,
     skip_invalid: bool = False,
+    invert_poses: bool = False,
     ignore_time: bool = False,
 ) -> PoseTable:
     """Read a table of poses, points or both.
@@ -109,6 +115,7 @@ def read_pose_table(
         units: of u and v, where the header does not say; px by default.
         skip_invalid: leave out rows that a column ``valid`` or ``status`` marks as invalid, and
             rows with empty cells, NaN, Inf or a pose of zeros; otherwise they are errors.
+        invert_poses: those of the file are tracker -> probe; their inverses are returned.
         ignore_time: times that are missing or cannot be read are no errors: the table has none.
 
     Raises:
@@ -136,10 +143,11 @@ def read_pose_table(
         file = None
         if columns.file is not None:
             file = tuple(table.rows[row][columns.file].strip().strip('"') for row in rows)
+        poses = _poses(table, columns, rows, pose_units)
         return PoseTable(
             name=table.name,
             lines=[table.lines[row] for row in rows],
-            poses=_poses(table, columns, rows, pose_units),
+            poses=inverse_poses(poses) if invert_poses and poses is not None else poses,
             points=points,
             kind="pixel" if unit == "px" else "point",
             time=time,
@@ -184,6 +192,7 @@ def read_crosswire(
     *,
     spacing_mm: np.ndarray | tuple[float, float] | None = None,
     pose_units: LengthUnit = "mm",
+    invert_poses: bool = False,
     minimum: int = MINIMUM_IMAGES,
 ) -> Recording:
     """Read a cross-wire recording: a text file of poses and one of pixels.
@@ -194,6 +203,7 @@ def read_crosswire(
         points_path: a row ``u v`` for each image: lateral and axial, px.
         spacing_mm: [lateral, axial] mm per px, when known.
         pose_units: of translations in the file.
+        invert_poses: those of the file are tracker -> probe; their inverses are taken.
         minimum: least number of images.
 
     Returns:
@@ -229,6 +239,9 @@ def read_crosswire(
         )
     poses = rows.reshape(-1, 3, 4)
     poses[:, :, 3] *= LENGTHS_MM[pose_units]
+    if invert_poses:
+        with naming(transforms_path):
+            poses = inverse_poses(check_poses(poses))
     images = make_images(poses, pixels, "pixel", spacing_mm=spacing_mm, minimum=minimum, where=name)
     return Recording(images, source=name)
 
@@ -238,6 +251,7 @@ def read_poses(
     *,
     quaternion: QuaternionOrder = "xyzw",
     pose_units: LengthUnit = "mm",
+    invert_poses: bool = False,
 ) -> Float[np.ndarray, "n 4 4"]:
     """Read a table of poses without a header, one a row.
 
@@ -246,6 +260,7 @@ def read_poses(
             row.
         quaternion: where the scalar stands.
         pose_units: of translations in the file.
+        invert_poses: return the inverses of the file's poses.
 
     Returns:
         (n, 4, 4), mm; quaternions are normalised, other rotations as they stand.
@@ -262,16 +277,16 @@ def read_poses(
         matrices = rows.reshape(len(rows), -1, 4)
         matrices[:, :3, 3] *= LENGTHS_MM[pose_units]
         poses[:, : matrices.shape[1]] = matrices
-        return poses
-    with naming(path):
-        try:
-            poses[:, :3, :3] = rotations_from_quaternions(
-                rows[:, 3:], quaternion, labels=_labels(table.lines)
-            )
-        except InputError as error:
-            raise FormatError(str(error)) from None
-    poses[:, :3, 3] = rows[:, :3] * LENGTHS_MM[pose_units]
-    return poses
+    else:
+        with naming(path):
+            try:
+                poses[:, :3, :3] = rotations_from_quaternions(
+                    rows[:, 3:], quaternion, labels=_labels(table.lines)
+                )
+            except InputError as error:
+                raise FormatError(str(error)) from None
+        poses[:, :3, 3] = rows[:, :3] * LENGTHS_MM[pose_units]
+    return inverse_poses(poses) if invert_poses else poses
 
 
 def _labels(lines: list[int]) -> list[str]:

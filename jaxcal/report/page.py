@@ -61,7 +61,7 @@ _DOCTYPE, _TITLE = "<!DOCTYPE html>", "<title>Calibration of "
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:"
 _KINDS = (
     ("lateral", "lateral", svg.BLUE),
-    ("range", "range", svg.GREEN),
+    ("range", "axial", svg.GREEN),
     ("elevational", "out of the plane", svg.ORANGE),
 )
 _FORMS: tuple[tuple[SaveFormat, str, str], ...] = (
@@ -488,7 +488,11 @@ def _limits(record: dict[str, Any]) -> str:
             rows.append((title, [(word, float(share), colour) for word, share, colour in shares]))
     sds = ", ".join(
         f"{word} {_length(record, f'sigma_{name}_mm', 'mm')}"
-        for (_, word, _), name in zip(_KINDS, ("lateral", "range", "elevation"), strict=True)
+        for word, name in (
+            ("lateral", "lateral"),
+            ("range", "range"),
+            ("out of the plane", "elevation"),
+        )
     )
     drawn = svg.stacked(rows, "Where the errors come from, in shares of mean squares")
     return _section(

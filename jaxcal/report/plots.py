@@ -17,7 +17,6 @@ from matplotlib.figure import Figure
 from jaxcal import InputError
 from jaxcal.data.poses import targets_in_images
 from jaxcal.data.recording import Recording
-from jaxcal.diagnostics.image_errors import KINDS
 from jaxcal.diagnostics.influence import in_image, influence_of
 from jaxcal.diagnostics.intervals import image_jacobian, tre_at
 from jaxcal.diagnostics.outliers import outliers, suspects
@@ -36,8 +35,8 @@ _ROUNDING = 3e-14
 """An excess of the objective below this relative size is only rounding."""
 _ALONG_A_SIDE = 61
 """Points along each side of the map of the error."""
-COLOURS = {"lateral": BLUE, "range": GREEN, "axial": GREEN, "elevational": ORANGE}
-"""Colours of the kinds of error."""
+COLOURS = {"lateral": BLUE, "axial": GREEN, "elevational": ORANGE}
+"""Colours of the directions in the image; an error of the range is an axial one."""
 
 
 def canvas(width_mm: float, height_mm: float) -> Figure:
@@ -222,12 +221,12 @@ def plot_limits(calibration: Calibration) -> Figure:
     rows = ("residual of\nthe target", "error of the calibration\nin the image")
     for row, values in enumerate((scatter_shares(answer), shares)):
         left = 0.0
-        for kind, share in zip(KINDS, values, strict=True):
+        for name, share in zip(COLOURS, values, strict=True):
             bar = panel.barh(
-                row, share, left=left, color=COLOURS[kind], height=0.6, label=kind if row else None
+                row, share, left=left, color=COLOURS[name], height=0.6, label=name if row else None
             )
             told = f"{100 * share:.0f} %" if share > 0.05 else ""
-            panel.bar_label(bar, [told], label_type="center", color=ink(COLOURS[kind]), fontsize=7)
+            panel.bar_label(bar, [told], label_type="center", color=ink(COLOURS[name]), fontsize=7)
             left += share
     panel.set_yticks([0, 1], rows)
     panel.set(xlim=(0, 1), xlabel="share of the mean square")

@@ -183,7 +183,7 @@ def fault_in_the_middle(tmp_path, name: str, speed: float, rest_s: float | None)
             at.append(bench.fault(name, **arguments))
 
         def say(line: str) -> None:
-            if line.startswith(("image 2/", "image 3/", "image 4/")) and not at:
+            if line.startswith(("image 1 (", "image 2 (", "image 3 (")) and not at:
                 threading.Thread(target=strike, daemon=True).start()
 
         request: AcquisitionRequest | None = AcquisitionRequest(IMAGES, "none", 1, bench=3)
@@ -227,7 +227,7 @@ def test_every_fault_stops_the_robot_and_the_run_is_resumed(tmp_path, name):
 
 @pytest.mark.parametrize(
     ("number", "times", "moment", "least"),
-    [(signal.SIGINT, 12, "image 1/", 1), (signal.SIGTERM, 1, "confirmed: ", 0)],
+    [(signal.SIGINT, 12, "image 0 (", 1), (signal.SIGTERM, 1, "confirmed: ", 0)],
     ids=["INT", "TERM"],
 )
 def test_signals_end_a_background_job_in_order(tmp_path, number, times, moment, least):
@@ -306,8 +306,8 @@ def test_a_person_takes_an_image_skips_a_pose_and_stops(tmp_path):
         person.wait_for("step 0.25 mm")
         person.type("+")
         person.wait_for("step 0.50 mm")
-        shown = do_as_told(person, "image 1/4: offset|resume")
-        assert "image 1/4: offset" in shown
+        shown = do_as_told(person, r"image 0 \(1 of 4\): offset|resume")
+        assert "image 0 (1 of 4): offset" in shown
         # The frame as half blocks, the bar, and how it went by place.
         assert shown.count("▀") > 1000
         assert "#" * 25 in shown
@@ -379,9 +379,9 @@ def test_a_robot_that_may_not_move_is_named_and_the_run_is_resumed(e_series, tmp
     bench.fault("robot_state", robot_mode=7, safety_mode=1)
 
     for image, name, wrong, right, text in (
-        ("image 1/", "robot_state", {"robot_mode": 7, "safety_mode": 5},
+        ("image 0 (", "robot_state", {"robot_mode": 7, "safety_mode": 5},
          {"robot_mode": 7, "safety_mode": 1}, "safeguard stop: close the gate"),
-        ("image 2/", "remote", {"on": False}, {"on": True}, "local control: switch it to remote"),
+        ("image 1 (", "remote", {"on": False}, {"on": True}, "local control: switch it to remote"),
     ):  # fmt: skip
         stopped = []
 
@@ -402,7 +402,7 @@ def test_a_robot_that_may_not_move_is_named_and_the_run_is_resumed(e_series, tmp
 
     def hold(line: str) -> None:
         lines.append(line)
-        if line.startswith("image 3/"):
+        if line.startswith("image 2 ("):
             pause.hold()
             threading.Timer(0.1, pause.go_on).start()
 
@@ -594,7 +594,7 @@ def test_killed_and_resumed(tmp_path, capfd):
     )
     assert process.stderr is not None
     for line in process.stderr:
-        if line.startswith("image 2/"):
+        if line.startswith("image 1 ("):
             break
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
@@ -758,7 +758,7 @@ def test_a_killed_view_changes_nothing_in_an_acquisition(tmp_path):
     with process.stderr:
         for line in process.stderr:
             lines.append(line)
-            if line.startswith("image 2/"):
+            if line.startswith("image 1 ("):
                 (viewer,) = viewers(process.pid)
                 os.kill(viewer, signal.SIGKILL)
     code = process.wait()
@@ -791,7 +791,7 @@ def test_a_failing_disk_is_one_line_and_status_4(tmp_path, what):
     lines = []
     for line in process.stderr:
         lines.append(line)
-        if line.startswith("image 1/") and what == "removed":
+        if line.startswith("image 0 (") and what == "removed":
             path.unlink()
     assert process.wait() == 4, lines
     process.stderr.close()

@@ -151,7 +151,7 @@ def test_the_arm_s_joints_decide_the_branch():
     found = inverse(UR5, flange_of(HOME, OFFSET)).joints
     low = found[np.argmin(joint_points(UR5, found)[:, 0, 2])]
     table = replace(ARM, box_min_mm=np.array([-2000.0, -2000.0, 100.0]))
-    with pytest.raises(RefusedError, match="pose 0 of the plan takes the arm's elbow"):
+    with pytest.raises(RefusedError, match="pose 1 of the plan takes the arm's elbow"):
         follow_all(table, poses, np.array([1.0]), low)
     # Without joints some branch is found.
     assert follow_all(table, poses, np.array([1.0])).branch != branch_of(UR5, low)
@@ -188,7 +188,7 @@ def test_plan_and_gate_check_the_arm():
     assert any("arm: UR5" in line for line in plan_lines(plan))
     assert check_plan(replace(plan, limits=replace(LIMITS, arm_model=""))) is None
     far = MotionPlan(np.stack([HOME, HOME]), replace(LIMITS, arm_model="UR3"), OFFSET, "1")
-    with pytest.raises(RefusedError, match="pose 0 of the plan"):
+    with pytest.raises(RefusedError, match="pose 1 of the plan"):
         check_plan(far)
     clock = Clock()
 
@@ -220,7 +220,7 @@ def test_the_whole_probe_is_held_along_an_arc():
     limits = replace(limits, hull_mm=(corner,))
     for end in ends:
         check_plan(MotionPlan(end[None], limits, OFFSET, "1"))
-    with pytest.raises(RefusedError, match="the way from pose 0 to pose 1 takes a corner of"):
+    with pytest.raises(RefusedError, match="the way from pose 1 to pose 2 takes a corner of"):
         check_plan(MotionPlan(np.array(ends), limits, OFFSET, "1"))
     low = replace(LIMITS, arm_model="", arm_box_max_mm=(2000.0, 2000.0, 299.0))
     with pytest.raises(RefusedError, match=r"takes the flange .* out of the arm's box"):

@@ -14,6 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -167,7 +168,7 @@ def test_a_run_from_the_command_line(tmp_path, capsys, tracked):
     assert main(["free-hand", f"127.0.0.1:{tracked}", str(path), "--images", "5"]) == 5
     told = capsys.readouterr()
     assert "poses from Probe to Reference" in told.err
-    assert "image 5/5" in told.err
+    assert "image 4 (5 of 5)" in told.err
     assert "Uncertain: expect points of the image to be " in told.out
     # On one line, to be copied, however long the path is.
     assert f"  jaxcal calibrate {path} --estimate scale --report report.html\n" in told.out
@@ -182,7 +183,7 @@ def test_a_run_from_the_command_line_to_a_calibration(tmp_path, capsys, plus_ser
     assert main(["free-hand", *arguments]) == 0
     told = capsys.readouterr()
     assert "poses from Probe to Reference" in told.err
-    assert "image 12/12" in told.err
+    assert "image 11 (12 of 12)" in told.err
     assert "the images agree to" in told.err
     check(path, 12, among=range(14), count=14)
     with h5py.File(path) as file:
@@ -214,7 +215,7 @@ def test_what_is_not_taken_is_said(tmp_path):
         server, port = started(
             processes, mode="separate", led=True, order=order, lost=[3], hidden=[4]
         )
-        person = Leading(server, image_3="u")
+        person = Leading(server, image_2="u")
         asked = FreeHand("127.0.0.1", port, images=5)
         assert acquire_free_hand(tmp_path / "r.h5", asked, person) == 5
     assert "not tracked: ProbeToTracker is not tracked" in person.words
@@ -222,6 +223,13 @@ def test_what_is_not_taken_is_said(tmp_path):
     assert any(words.startswith("as in image #") for words in person.words)
     assert {"moving: bring the target into the image and hold still", "hold still"} <= person.words
     assert any(line.startswith("taken back: the last image; 2 are left") for line in person.lines)
+    # Numbers are those of the recording, also after one was taken back: --leave-out takes them.
+    told = [re.match(r"image (\d) \((\d) of 5\): target at", line) for line in person.lines]
+    assert [each.groups() for each in told if each] == [
+        ("0", "1"), ("1", "2"), ("2", "3"), ("3", "3"), ("4", "4"), ("5", "5")
+    ]  # fmt: skip
+    mask = jaxcal.load(tmp_path / "r.h5").calibration.mask
+    assert mask.tolist() == [True, True, False, True, True, True]
     assert any("bring the target to the" in advice for advice in person.advice)
     # The third was taken back while its pose was still held, and so taken again; or not.
     images = jaxcal.load(tmp_path / "r.h5").calibration
@@ -245,7 +253,7 @@ def test_a_lost_stream_is_gone_on_with(tmp_path, plus_server):
         before = len(file["calibration/pose"])
     port = plus_server(**asked, first=before)
     again = FreeHand("127.0.0.1", port)
-    interrupting = Scripted(image_6="ctrl-c")
+    interrupting = Scripted(image_5="ctrl-c")
     with pytest.raises(FreeHandStopped, match="interrupted; 6 of 7") as stopped:
         acquire_free_hand(path, again, interrupting, resume=True)
     assert stopped.value.exit_code == 130
@@ -261,7 +269,7 @@ def test_a_lost_stream_is_gone_on_with(tmp_path, plus_server):
 def test_too_few_images_stay_resumable(tmp_path, tracked):
     asked = FreeHand("127.0.0.1", tracked, images=9)
     with pytest.raises(FreeHandStopped, match="1 images are too few: 4 are needed"):
-        acquire_free_hand(tmp_path / "r.h5", asked, Scripted(image_1="q"))
+        acquire_free_hand(tmp_path / "r.h5", asked, Scripted(image_0="q"))
 
 
 def test_poses_in_metres_are_noticed_at_the_second_image(tmp_path, tracked, plus_server):
@@ -391,7 +399,7 @@ def test_ctrl_c_at_a_terminal(tmp_path, tracked):
     command = "import sys; from hw.cli.main import main; sys.exit(main(sys.argv[1:]))"
     arguments = ["-c", command, "free-hand", f"127.0.0.1:{tracked}", "r.h5"]
     with Terminal(arguments, tmp_path) as person:
-        person.wait_for(r"image 1/30: target at")
+        person.wait_for(r"image 0 \(1 of 30\): target at")
         person.wait_for("next: bring the target to the")
         person.type("u")
         person.wait_for("taken back: the last image; ")
@@ -615,9 +623,9 @@ def test_a_tracker_that_is_frozen_has_no_image_taken():
         look = guide.look(still(pose, 0.1 * number, frame(rng, pixels[number // 20])))
         words.append(look.words)
         if look.taken is not None:
-            guide.keep(look.taken)
+            guide.keep(replace(look.taken, row=len(guide.taken)))
     assert [each.time // 2.0 for each in guide.taken] == [0, 2]
-    frozen = "the pose is that of image 1, but the target is elsewhere in the image: is the tracker"
+    frozen = "the pose is that of image 0, but the target is elsewhere in the image: is the tracker"
     assert any(each.startswith(frozen) for each in words)
 
 

@@ -195,7 +195,7 @@ class Person:
 
 def test_a_person_follows_the_bar_by_hand(tmp_path, bench):
     path, person = tmp_path / "r.h5", Person(bench.hand)
-    stopping = Person(bench.hand, image_2="u", taken_back="ctrl-c")
+    stopping = Person(bench.hand, image_1="u", taken_back="ctrl-c")
     with pytest.raises(FreeHandStopped, match="interrupted; 1 of 4 images") as stopped:
         acquire_by_injection(path, bench.asked, bench.setup, stopping)
     assert stopped.value.exit_code == 130
@@ -368,11 +368,11 @@ def test_from_the_command_line(tmp_path, bench):
     ]
     bench.hand.offset = bench.hand.aim = -3.0
     with Terminal(["-c", command, *arguments], tmp_path) as person:
-        person.wait_for("image 1 of 30: the element is not heard")
+        person.wait_for(r"image 0 \(1 of 30\): the element is not heard")
         bench.hand.go(REACH_MM)
-        person.wait_for(r"image 1 of 30: +[+-]\d+\.\d\d mm \|#")
+        person.wait_for(r"image 0 \(1 of 30\): +[+-]\d+\.\d\d mm \|#")
         person.wait_for(r"next: (slide|here|go)")
-        person.wait_for(r"image 1 of 30: +\+\d+\.\d\d mm \| +\|")
+        person.wait_for(r"image 0 \(1 of 30\): +\+\d+\.\d\d mm \| +\|")
         person.type("\r")
         person.wait_for("the element is not heard here")
         # Where the machine was too busy to see enough of the sweep, the advice is to sweep on.
@@ -384,7 +384,7 @@ def test_from_the_command_line(tmp_path, bench):
         answer = "too early"
         while not answer.startswith("image"):
             person.type("\r")
-            taken = r"image 1/30: offset [+-]\d\.\d\d in \["
+            taken = r"image 0 \(1 of 30\): offset [+-]\d\.\d\d in \["
             answer = person.wait_for(rf"{taken}|hold still for|the probe moved")[0]
         person.type("\x03")
         assert person.finish() == 130

@@ -32,6 +32,8 @@ from hw.runtime.errors import RefusedError
         (["acquire"], "either --bench or --setup"),
         (["acquire", "--bench", "--setup", "x.toml"], "either --bench or --setup"),
         (["acquire", "--bench", "--resume"], "needs the RECORDING"),
+        (["acquire", "points.csv", "--bench"], "points.csv: a recording is named .h5 or .hdf5"),
+        (["free-hand", "localhost", "sweep"], "sweep: a recording is named .h5 or .hdf5"),
         (
             ["acquire", "a.h5", "--bench", "--resume", "--images", "5"],
             "--images cannot be used with --resume",
@@ -85,7 +87,8 @@ def test_a_dry_run_shows_the_plan_and_makes_nothing(tmp_path, monkeypatch, capsy
     assert main([*arguments, "--phantom", "cross-wire"]) == 2
     assert "needs the images: add [ultrasound]" in capsys.readouterr().err
     path.write_text(good)
-    for name, said in (("bench.toml", "exists already"), ("no/out.h5", "there is no folder")):
+    (tmp_path / "old.h5").touch()
+    for name, said in (("old.h5", "exists already"), ("no/out.h5", "there is no folder")):
         assert main([arguments[0], name, *arguments[2:]]) != 0
         assert said in capsys.readouterr().err
     armed = good.replace("settle_s = 1", 'model = "ur5"\ntcp_offset = [0, 0, 0.12, 0, 0, 0]')

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -116,6 +118,12 @@ def test_preview_is_a_figure(tmp_path):
     assert (imread(path)[[0, -1]] == 1).all()  # no title is cut off
     preview(plan, path, np.array([[180.0, -420.0, 40.0], [520.0, -80.0, 270.0]]))
     assert path.read_bytes() != without
+    # SVG keeps what is written as comments: poses from 1, as the run counts them, and no half ones.
+    preview(plan_poses(4, SCENE), tmp_path / "plan.svg")
+    shown = re.findall("<!-- (.*?) -->", (tmp_path / "plan.svg").read_text())
+    bar = shown.index("pose, in the order of the plan")
+    assert shown[bar - 4 : bar] == ["1", "2", "3", "4"]
+    assert "depth (mm)" in shown
 
 
 def test_what_the_placement_noted_is_told_with_the_image():

@@ -252,7 +252,7 @@ def test_every_reason_has_its_line():
         check_plan(plan_of([pose(400, -5, 280, (20.0, 0, 0))]))
     tilted = plan_of([pose(400, -100, 280, (34.9, 0, 0))])
     check_plan(tilted)
-    with pytest.raises(RefusedError, match="pose 0 of the plan tilts the tool 36"):
+    with pytest.raises(RefusedError, match="pose 1 of the plan tilts the tool 36"):
         check_plan(plan_of([pose(400, -100, 280, (36.0, 0, 0))]))
 
 
@@ -274,7 +274,7 @@ def test_the_tip_s_arc_is_checked_between_two_poses_inside():
     ends = [pose(400.0, -100.0, 280.0, (tilt, 0.0, 0.0)) for tilt in (-14.0, 14.0)]
     for end in ends:
         check_plan(plan_of([end], limits))
-    with pytest.raises(RefusedError, match="the way from pose 0 to pose 1 takes the probe's tip"):
+    with pytest.raises(RefusedError, match="the way from pose 1 to pose 2 takes the probe's tip"):
         check_plan(plan_of(ends, limits))
 
 
