@@ -94,9 +94,10 @@ def grid_panel(panel: Axes, grid: Float[np.ndarray, "elevations noises"], half: 
 
     image = panel.imshow(grid, cmap="RdBu_r", vmin=1 - half, vmax=1 + half, origin="lower")
     for i, j in np.argwhere(np.isfinite(grid)):
+        red, green, blue, _ = image.to_rgba(grid[i, j])
         panel.text(
             j, i, f"{grid[i, j]:.2f}", ha="center", va="center", fontsize="small",
-            color=ink(to_hex(image.to_rgba(grid[i, j]))),
+            color=ink(to_hex((red, green, blue))),
         )  # fmt: skip
     panel.set_xticks(range(len(NOISES_MM)), [f"{noise:g}" for noise in NOISES_MM])
     panel.set_yticks(range(len(grid)), [f"{size:g}" for size in ELEVATIONS_MM[-len(grid) :]])
