@@ -403,7 +403,7 @@ def test_ctrl_c_at_a_terminal(tmp_path, tracked):
         person.wait_for("next: bring the target to the")
         person.type("u")
         person.wait_for("taken back: the last image; ")
-        person.wait_for(r"image \d/30: target at")
+        person.wait_for(r"image \d \(\d of 30\): target at")
         person.type("\x03")
         assert person.finish() == 130
         assert person.shown.count("▀") > 1000
