@@ -148,8 +148,8 @@ def acquire(
         request = _requested((bench_seed or 0) if bench else None, wanted)
     phantom, operator = request.phantom, request.operator
     controller = controller or request.controller
-    _check_installed(phantom, bench, move)
     path = recording_path(recording, "acquisition", resume)
+    _check_installed(phantom, bench, move)
 
     prepare_jax()
     with ExitStack() as stack:
