@@ -686,8 +686,6 @@ POINTS_OF_SIX = "\n".join(table(["u", "v"], [PIXELS]))
 @pytest.mark.parametrize(
     ("sources", "options", "message"),
     [
-        ("s.mha", "--lag 0.3", "--lag needs --poses"),
-        ("s.mha p.csv", "--lag 0.3", "--lag needs --poses"),
         ("s.mha p.csv", "--quaternion wxyz", "--quaternion is for tables with poses"),
         ("s.mha p.csv", "--points labels", "--points labels is for points of Slicer"),
         ("s.mha n.csv", "--points order", "leave --points order out"),
@@ -705,7 +703,7 @@ POINTS_OF_SIX = "\n".join(table(["u", "v"], [PIXELS]))
         ("t.csv", "--to Bar", "--to does not go with"),
         ("t.csv", "--target echo", "--target does not go with"),
         ("t.csv", "--region 1 2 3 4", "--region does not go with"),
-        ("t.csv", "--lag 0.1", "--lag does not go with"),
+        ("t.csv", "--lag 0.1", "--lag is for poses that are matched"),
         ("t.csv", "--points order", "--points does not go with"),
         ("t.csv", "--orientation MF", "--orientation does not go with"),
         ("m.csv", "--quaternion xyzw", "m.csv: its poses are matrices: leave --quaternion out"),
@@ -1038,10 +1036,14 @@ def test_images_are_added_to_a_recording(tmp_path, capsys):
     assert len(jaxcal.load(out)) == 8
 
     whole = jaxcal.load(first)
-    bounded = replace(whole.calibration, max_elevation=np.ones(4), amplitude=np.ones(4))
+    bounded = replace(
+        whole.calibration, max_elevation=np.ones(4), amplitude=np.ones(4), velocity=np.ones((4, 6))
+    )
     jaxcal.save(replace(whole, calibration=bounded), tmp_path / "bounded.h5")
     assert main(["import", more, out, "--add-to", str(tmp_path / "bounded.h5")]) == 0
     assert "- bounds on the offsets, amplitudes are left out" in capsys.readouterr().out
+    moving = np.isfinite(jaxcal.load(out).calibration.velocity).all(axis=1)
+    assert moving.tolist() == [True] * 4 + [False] * 2
 
     def refused(*arguments: str) -> str:
         assert main(["import", *arguments]) == 2

@@ -683,13 +683,14 @@ def test_a_lag_that_fits_the_points_better_is_told(tmp_path, late, capsys):
         "as it is": [images, given, out, "--poses", log_table],
         "stated": [images, given, out, "--poses", log_table, "--lag", str(late)],
         "tables": [log_table, given, out],
+        "stated of tables": [log_table, given, out, "--lag", str(late)],
     }.items():
         assert main(["import", *arguments]) == 0
         said[name] = capsys.readouterr().out
     found = {
         name: re.search(r"better at a lag of (\S+) s(.*)", text) for name, text in said.items()
     }
-    assert found["stated"] is None
+    assert found["stated"] is found["stated of tables"] is None
     if late == 0:
         assert not any(found.values())
     elif late > 0.5:
@@ -697,8 +698,8 @@ def test_a_lag_that_fits_the_points_better_is_told(tmp_path, late, capsys):
         assert "do images and poses use the same clock?" in said["tables"]
     else:
         assert abs(float(found["as it is"][1]) - late) < 0.01
-        assert f"state it (--lag {found['as it is'][1]})" in said["as it is"]
-        assert f"subtract {found['tables'][1]} s from the images' times" in said["tables"]
+        for name in ("as it is", "tables"):
+            assert f"state it (--lag {found[name][1]})" in said[name]
 
 
 def turning(t: np.ndarray) -> np.ndarray:
@@ -727,6 +728,46 @@ def test_a_lag_is_estimated_from_points(tmp_path, lagging, capsys):
     np.testing.assert_allclose(images.measurements, points)
     assert main(["import", *sources, *tracking, "nan"]) == 2
     assert "neither a number of seconds nor auto" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("kind", ["sequence", "table"])
+def test_a_lag_of_images_that_have_poses_of_their_own(tmp_path, kind, capsys):
+    """Poses in the same file were taken as they stood, and no lag could be stated."""
+    times = 2 + 0.1 * np.arange(60)
+    seen = np.linalg.inv(turning(times - 0.12)) @ [300.0, -40.0, 80.0, 1]
+    points = 500 + 4 * seen[:, :2] + np.random.default_rng(2).normal(0, 1, (60, 2))
+    path = tmp_path / "o.h5"
+    if kind == "table":
+        rows = [times, *turning(times)[:, :3].reshape(60, 12).T, *points.T]
+        names = ["time", *(f"m{i}{j}" for i in range(1, 4) for j in range(1, 5)), "u", "v"]
+        lines = [",".join(map(repr, map(float, row))) for row in np.column_stack(rows)]
+        (tmp_path / "t.csv").write_text("\n".join([",".join(names), *lines]))
+        assert main(["import", str(tmp_path / "t.csv"), str(path)]) == 0
+        lag = 0.0
+    else:
+        write_sequence(tmp_path / "i.igs.mha", {PAIR: turning(times)}, times)
+        lines = [f"{k},{u},{v}" for k, (u, v) in enumerate(points)]
+        (tmp_path / "p.csv").write_text("\n".join(["frame,u,v", *lines]))
+        sources = [str(tmp_path / name) for name in ("i.igs.mha", "p.csv")]
+        assert main(["import", *sources, str(path)]) == 0
+        lag = float(re.search(r"better at a lag of (\S+) s", capsys.readouterr().out)[1])
+        assert lag == pytest.approx(0.12, abs=0.01)
+        path.unlink()
+        assert main(["import", *sources, str(path), "--lag", "auto"]) == 0
+        lag = float(re.search(r"images lag by (\S+) s", capsys.readouterr().out)[1])
+        assert lag == pytest.approx(0.12, abs=0.01)
+    images = jaxcal.load(path).calibration
+    at = images.time - lag
+    # Interpolated between poses 0.1 s apart.
+    assert np.abs(images.poses[:, :3, 3] - turning(at)[:, :3, 3]).max() < 0.5
+    step = 1e-4
+    change = np.linalg.inv(turning(at - step)) @ turning(at + step) / (2 * step)
+    v, omega = change[:, :3, 3], change[:, [2, 0, 1], [1, 2, 0]]
+    known = np.isfinite(images.velocity).all(axis=1)
+    assert known.sum() >= len(at) - 4
+    scale = np.abs(v).max(), np.abs(omega).max()
+    assert np.abs(images.velocity[known, :3] - v[known]).max() < 0.1 * scale[0]
+    assert np.abs(images.velocity[known, 3:] - omega[known]).max() < 0.1 * scale[1]
 
 
 def test_times_that_go_back_are_told_to_be_those_of_the_poses(tmp_path, lagging):
@@ -765,9 +806,10 @@ def test_lags_that_cannot_be_estimated(tmp_path, lagging, folder, capsys):
     log = np.arange(0, 7, 0.01)
     write_sequence(still, {PAIR: np.tile(POSES[0], (len(log), 1, 1))}, log)
     for arguments, message in (
-        ([images, points, out, "--poses", still], "--lag auto: the probe moved by"),
-        ([images, points, out], "--lag needs --poses"),
-        ([points, out], "--lag does not go with a table of poses and points"),
+        ([images, points, out, "--poses", still], "--lag auto: the images do not tell the lag"),
+        ([images, points, out], "holds no transforms: name the file with its poses (--poses)"),
+        ([points, out], "--lag is for poses that are matched to images by their times"),
+        ([str(folder), out], "--lag needs --poses: a folder of images has no poses"),
         ([str(folder), out, "--poses", table], "--lag is for poses that are matched by time"),
     ):
         assert main(["import", *arguments, "--lag", "auto"]) == 2
@@ -800,6 +842,31 @@ def test_real_images_and_tracking_in_two_files(tmp_path, real_data):
     places = np.interp(times, tracked.time[valid], poses[valid, 0, 3])
     np.testing.assert_allclose(recording.calibration.poses[:, 0, 3], places, atol=0.05)
     assert any("at the images' times" in note for note in notes)
+
+
+def test_the_lag_of_real_images_is_that_of_plus(tmp_path, real_data):
+    """Of a probe that is moved up and down over a tank's bottom, by PLUS's own estimate."""
+    folder = real_data / "plus"
+    video = folder / "WaterTankBottomTranslationVideoBuffer.igs.mha"
+    text = (folder / "TemporalCalibrationResultsBaseline.xml").read_text()
+    (of_tracker,) = re.findall(r'TrackerLagSec="(\S+)"', text)
+    rows = []
+    frames = range(0, 201, 2)
+    for image in read_sequence(video).images(frames):
+        profile = image[:, 370:450].mean(axis=1)
+        top = 60 + int(np.argmax(profile[60:]))
+        near = np.arange(top - 6, top + 7)
+        rows.append(near @ profile[near] / profile[near].sum())
+    lines = [f"{frame},410,{row!r}" for frame, row in zip(frames, map(float, rows), strict=True)]
+    (tmp_path / "p.csv").write_text("\n".join(["frame,u,v", *lines]))
+    options = ImportOptions(
+        poses=folder / "WaterTankBottomTranslationTrackerBuffer.igs.mha",
+        source="Probe", target="Reference", lag_s="auto",
+    )  # fmt: skip
+    _, notes, *_ = import_files([video, tmp_path / "p.csv"], options)
+    found = re.search(r"images lag by (\S+) s behind poses \(SD (\S+) s\)", "".join(notes))
+    assert abs(float(found[1]) + float(of_tracker)) < 0.005
+    assert float(found[2]) < 0.015
 
 
 # DICOM.

@@ -27,7 +27,7 @@ from jaxcal.study.results import open_results
 
 ROOT = Path(__file__).parents[1]
 COUNT = 6
-OPTIONAL = ("mask", "covariance", "max_elevation", "amplitude", "time")
+OPTIONAL = ("mask", "covariance", "max_elevation", "amplitude", "time", "velocity")
 
 
 def random_poses(generator, count):
@@ -56,6 +56,9 @@ def random_images(generator, kind, count, optional, elements=8):
         "max_elevation": generator.uniform(0, 3, count),
         "amplitude": generator.uniform(0, 4096, count),
         "time": np.sort(generator.uniform(0, 60, count)),
+        "velocity": np.where(
+            np.arange(count)[:, None] == 1, np.nan, generator.normal(size=(count, 6))
+        ),
     }
     if kind == "pixel":
         values |= {"spacing_mm": generator.uniform(0.05, 0.3, 2), "frame_size": (640, 640)}
@@ -176,6 +179,7 @@ def test_saved_file_is_marked_and_has_units(tmp_path):
     assert units.pop("calibration/pixel") == "px"
     assert units.pop("calibration/covariance") == "px^2"
     assert units.pop("calibration/time") == "s"
+    assert units.pop("calibration/velocity") == "mm/s, rad/s"
     assert {name for name in units if units[name] == "mm"} >= {
         "calibration/pose",
         "calibration/max_elevation",
@@ -421,6 +425,7 @@ def test_header(path, name, value, message):
         ("calibration/time", "ms", "s"),
         ("calibration/covariance", "mm", r"mm\^2"),
         ("calibration/max_elevation", "cm", "mm"),
+        ("calibration/velocity", "m/s, rad/s", "mm/s, rad/s"),
     ],
 )
 def test_wrong_units(path, where, unit, right):
@@ -428,6 +433,7 @@ def test_wrong_units(path, where, unit, right):
         file["calibration/time"] = np.arange(COUNT)
         file["calibration/covariance"] = np.tile(np.eye(2), (COUNT, 1, 1))
         file["calibration/max_elevation"] = np.ones(COUNT)
+        file["calibration/velocity"] = np.full((COUNT, 6), np.nan)
         file[where].attrs["units"] = right.replace("\\", "")
     load(path)
     with h5py.File(path, "r+") as file:
@@ -474,6 +480,7 @@ def with_nan(values):
         ("mask", lambda _: np.ones(COUNT - 1, bool), r"mask must have shape \(6,\)"),
         ("time", lambda _: np.full(COUNT, np.inf), "time 0 is NaN or Inf"),
         ("max_elevation", lambda _: -np.ones(COUNT), "max_elevation 0 is negative"),
+        ("velocity", lambda _: np.full((COUNT, 6), np.inf), "velocity 0 holds Inf"),
         ("amplitude", lambda _: np.ones(COUNT + 1), r"amplitude must have shape \(6,\)"),
         ("covariance", lambda _: np.zeros((COUNT, 2, 2)), "covariance 0 is not symmetric"),
     ],

@@ -68,8 +68,8 @@ TRACKING = (
         type=_Lag(),
         default=0.0,
         metavar="SECONDS",
-        help="With --poses: an image stamped t shows what was at t - SECONDS; auto: estimated from "
-        "the target's motion in the images (not for jaxcal pick).",
+        help="An image stamped t shows what was at t - SECONDS: poses are looked up there; auto: "
+        "estimated from the target in the images (not for jaxcal pick).",
     ),
     click.option(
         "--orientation",

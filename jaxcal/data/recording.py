@@ -83,6 +83,8 @@ class Images:
         max_elevation: (n,) bound on |elevational offset|, mm, or None.
         amplitude: (n,) received amplitude, arbitrary unit, or None.
         time: (n,) s, or None.
+        velocity: (n, 6) of the probe at that time, in its own frame: translation, mm/s, and
+            rotation, rad/s; NaN where it is not known; or None.
         spacing_mm: (2,) mm per px [lateral, axial] for pixels; None when unknown.
         face_offset_mm: range of pixel row 0, or of a measured range of 0, mm.
         time_of_flight: (n, elements) the times, s, that points were segmented from, or None.
@@ -98,6 +100,7 @@ class Images:
     max_elevation: Float[np.ndarray, " n"] | None = None
     amplitude: Float[np.ndarray, " n"] | None = None
     time: Float[np.ndarray, " n"] | None = None
+    velocity: Float[np.ndarray, "n 6"] | None = None
     spacing_mm: Float[np.ndarray, " 2"] | None = None
     face_offset_mm: float = 0.0
     time_of_flight: Float[np.ndarray, "n elements"] | None = None
@@ -268,11 +271,20 @@ def joined(first: Recording, second: Recording) -> Recording:
         values = getattr(a, name), getattr(b, name)
         return None if any(value is None for value in values) else np.concatenate(values)
 
+    velocity = None
+    if a.velocity is not None or b.velocity is not None:
+        velocity = np.concatenate(
+            [
+                np.full((len(each), 6), np.nan) if (v := each.velocity) is None else v
+                for each in (a, b)
+            ]
+        )
     return replace(
         first,
         calibration=replace(
             a,
             **{name: both(name) for name in ("poses", "measurements", "mask", *OF_SOME)},
+            velocity=velocity,
             frame_size=a.frame_size or b.frame_size,
         ),
         truth=None,
@@ -325,6 +337,7 @@ def make_images(
     max_elevation: np.ndarray | float | None = None,
     amplitude: np.ndarray | None = None,
     time: np.ndarray | None = None,
+    velocity: np.ndarray | None = None,
     spacing_mm: np.ndarray | tuple[float, float] | None = None,
     face_offset_mm: float = 0.0,
     time_of_flight: np.ndarray | None = None,
@@ -344,6 +357,7 @@ def make_images(
         max_elevation: (n,) or one number, mm, not negative.
         amplitude: (n,).
         time: (n,) s.
+        velocity: (n, 6) mm/s and rad/s, see :class:`Images`.
         spacing_mm: [lateral, axial] mm per px, pixels only.
         face_offset_mm: range of pixel row 0, or of a measured range of 0, mm; not with times.
         time_of_flight: (n, elements) s, points only: the times that they were segmented from.
@@ -397,6 +411,7 @@ def make_images(
             max_elevation=checked_bound(max_elevation, count, used),
             amplitude=_per_image("amplitude", amplitude, count, used, fill=0.0),
             time=_per_image("time", time, count, used, fill=0.0),
+            velocity=_velocity(velocity, count),
             spacing_mm=spacing,
             face_offset_mm=face_mm,
             time_of_flight=_raw_times(time_of_flight, kind, count, used),
@@ -593,6 +608,14 @@ def _per_image(
     values = _shaped(values, name, (count,))
     values[~used] = fill
     _refuse(name, ~np.isfinite(values), "is NaN or Inf")
+    return values
+
+
+def _velocity(values: np.ndarray | None, count: int) -> Float[np.ndarray, "n 6"] | None:
+    if values is None:
+        return None
+    values = _shaped(values, "velocity", (count, 6))
+    _refuse("velocity", np.isinf(values).any(axis=1), "holds Inf")
     return values
 
 

@@ -1,8 +1,8 @@
 """Time alignment: poses between samples, a device's clock against the host's, a stream's latency.
 
 A pose and an image that belong together have time stamps of different clocks. Three steps match
-them: :func:`fit_clock` converts device stamps to the host's clock; :func:`estimate_latency` finds
-the remaining time by which images lag behind poses, from a motion that both show;
+them: :func:`fit_clock` converts device stamps to the host's clock; :func:`fitted_lag` finds
+the remaining time by which images lag behind poses, from a target at rest;
 :func:`interpolate_poses` gives the pose at an image's time, and refuses where it would have to
 guess.
 
@@ -11,7 +11,7 @@ Numpy and scipy throughout: this runs once a recording, on hundreds of samples a
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -20,9 +20,6 @@ from jaxcal.data.poses import check_poses
 from jaxcal.runtime.array_types import Bool, Float
 from jaxcal.runtime.given_values import real_array
 from jaxcal.runtime.messages import seconds
-
-MINIMUM_MOTION_MM = 8.0
-"""Least motion from which a latency is estimated."""
 
 LEVER_MM = 100.0
 """The lever, from the tracked origin: about the distance of a target from the probe's marker."""
@@ -33,16 +30,17 @@ LARGEST_LAG_S = 0.5
 LARGEST_LAG_SD_S = 0.02
 """Largest SD of a lag that is used: a probe moves by about a millimetre in this time."""
 
-_TILT = np.tan(np.radians(30.0))
+VELOCITY_S = 0.05
+"""A velocity is that of the motion from so long before to so long after: hands shake slower, and
+the tracker's noise of 0.1 mm becomes 1.4 mm/s."""
 
-_LAG_STEP_S = 1e-3
-_SHORTEST_OVERLAP_S = 1.0
-_RIVAL = 0.98
-_MINIMUM_CORRELATION = 0.8
+LAG_EVIDENCE = 25.0
+"""A lag is told if its evidence is larger: a normal variable's square at 5 SD."""
+
 _COARSEST_S = 1e-3
 """A clock's times, as seconds, have digits for at least a millisecond."""
-_PARABOLA_STEPS, _TOP = 5, 0.99
-_FIT_STEP_S = 0.025
+_FIT_STEP_S, _FINE_STEPS = 0.025, 11
+"""Between lags that are tried; and how many more are tried about the best one."""
 _FIT_IMAGES = 12, 200
 """Least and most images that are fitted at every lag."""
 
@@ -194,6 +192,40 @@ def interpolation_error(
     return float(np.sqrt(np.mean(np.nanmean(ends[:, known], axis=0) * (since * left)[known] ** 2)))
 
 
+def pose_velocities(
+    t: np.ndarray,
+    poses: np.ndarray,
+    query: np.ndarray,
+    *,
+    max_gap_s: float,
+    valid: np.ndarray | None = None,
+) -> Float[np.ndarray, "m 6"]:
+    """How the tracked probe moves, from poses ``VELOCITY_S`` before and after each time.
+
+    The arguments are those of :func:`can_interpolate`, and ``poses`` (n, 4, 4), mm.
+
+    Returns:
+        Velocities [v, omega] in the probe's own frame, so that the pose s later is the pose times
+        Exp(s [v, omega]): mm/s and rad/s. NaN where a pose before or after cannot be interpolated.
+
+    Raises:
+        InputError: times out of order or not numbers, or poses that are not rigid.
+    """
+    from scipy.spatial.transform import Rotation
+
+    ends = np.stack([_queries(query) - VELOCITY_S, _queries(query) + VELOCITY_S])
+    between = can_interpolate(t, ends.ravel(), max_gap_s=max_gap_s, valid=valid)
+    known = between.reshape(ends.shape).all(axis=0)
+    found = interpolate_poses(t, poses, ends[:, known].ravel(), max_gap_s=max_gap_s, valid=valid)
+    before, after = found.reshape(2, -1, 4, 4)
+    turned = Rotation.from_matrix(np.swapaxes(before[:, :3, :3], 1, 2) @ after[:, :3, :3])
+    halfway = Rotation.from_matrix(before[:, :3, :3]) * Rotation.from_rotvec(turned.as_rotvec() / 2)
+    moved = halfway.inv().apply(after[:, :3, 3] - before[:, :3, 3])
+    velocity = np.full((ends.shape[1], 6), np.nan)
+    velocity[known] = np.hstack([moved, turned.as_rotvec()]) / (2 * VELOCITY_S)
+    return velocity
+
+
 @dataclass(frozen=True)
 class ClockFit:
     """A device's clock in terms of the host's: host = device + offset + drift (device - reference).
@@ -263,135 +295,19 @@ def _lower_envelope(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
 
 
 @dataclass(frozen=True)
-class Latency:
-    """By how much images lag behind poses.
-
-    Attributes:
-        lag_s: an image stamped t shows what was at t - lag: its pose is the one at t - lag.
-        correlation: of the two motions at that lag, -1 to 1.
-        sd_s: standard deviation of the lag from the misfit of the two motions, s.
-    """
-
-    lag_s: float
-    correlation: float
-    sd_s: float
-
-
-def estimate_latency(
-    t_video: np.ndarray, video: np.ndarray, t_tracker: np.ndarray, tracker_mm: np.ndarray
-) -> Latency:
-    """Lag of the images behind the poses, from one motion that both show.
-
-    As in PLUS's temporal calibration (Lasso et al. 2014, IEEE Trans. Biomed. Eng. 61, 2527): the
-    probe is moved to and fro; the video's signal stays fixed, the tracker's is moved along the time
-    axis in steps of a millisecond, and the normalised correlation over the same samples tells how
-    well they agree. A parabola about the best lag refines it to a fraction of a step. The signals
-    may have any scale and sign.
-
-    Args:
-        t_video: (n,) stamps of the images, s, on the tracker's clock.
-        video: (n,) position of something at rest as the images show it, in any unit.
-        t_tracker: (m,) stamps of the poses, s.
-        tracker_mm: (m,) position of the probe, mm.
-
-    Raises:
-        InputError: too little motion or overlap, signals that do not agree, a best lag at the edge
-            of the search, or several that fit alike (a periodic motion).
-    """
-    t_video = _increasing(t_video, "time of image", 8)
-    t_tracker = _increasing(t_tracker, "time of pose", 8)
-    video = real_array(video, "the images' motion")
-    tracker = real_array(tracker_mm, "the probe's motion")
-    if video.shape != t_video.shape or tracker.shape != t_tracker.shape:
-        raise InputError("each motion must have one value for each of its times")
-    if not (np.isfinite(video).all() and np.isfinite(tracker).all()):
-        raise InputError("a motion holds NaN or Inf: leave those samples out")
-    # The same images are used at every lag: a lag with fewer images could win by chance.
-    used = (t_video - LARGEST_LAG_S >= t_tracker[0]) & (t_video + LARGEST_LAG_S <= t_tracker[-1])
-    t, signal = t_video[used], video[used]
-    if len(t) < 8 or t[-1] - t[0] < _SHORTEST_OVERLAP_S:
-        needed = _SHORTEST_OVERLAP_S + 2 * LARGEST_LAG_S
-        raise InputError(
-            f"images and poses overlap by too little: {needed:g} s or more of both are needed"
-        )
-    during = tracker[(t_tracker >= t[0] - LARGEST_LAG_S) & (t_tracker <= t[-1] + LARGEST_LAG_S)]
-    span = float(np.ptp(during))
-    if span < MINIMUM_MOTION_MM:
-        raise InputError(f"the probe moved by {span:.3g} mm; {MINIMUM_MOTION_MM:g} are needed")
-    if np.ptp(signal) == 0:
-        raise InputError("the images show no motion")
-    steps = round(LARGEST_LAG_S / _LAG_STEP_S)
-    lags = np.arange(-steps, steps + 1) * _LAG_STEP_S
-    centred = signal - signal.mean()
-    centred = centred / np.linalg.norm(centred)
-    correlation = np.zeros(len(lags))
-    for i, lag in enumerate(lags):
-        moved = np.interp(t - lag, t_tracker, tracker)
-        moved -= moved.mean()
-        size = np.linalg.norm(moved)
-        correlation[i] = centred @ moved / size if size > 0 else 0.0
-    return _peak(lags, correlation, len(t))
-
-
-def latency_of_positions(
-    t_video: Float[np.ndarray, " n"],
-    points: Float[np.ndarray, "n 2"],
-    t_tracker: Float[np.ndarray, " m"],
-    positions: Float[np.ndarray, "m 3"],
-) -> Latency:
-    """Lag of the images behind the poses, from a motion to and fro along one line.
-
-    The images' signal is :func:`estimate_latency`'s along the direction in which their points
-    differ most, and the tracker's along that of the probe. These may be different directions of
-    the motion: pixels are not square, and the image shows nothing of a motion across its plane. So
-    both are tilted by 30 degrees towards each of the other directions, and what that changes is
-    part of the SD. It is nothing where the motion is along one line.
-
-    Args:
-        t_video: stamps of the images, s, on the tracker's clock.
-        points: a target at rest in the images, px or mm.
-        t_tracker: stamps of the poses, s.
-        positions: of the probe, mm.
-
-    Raises:
-        InputError: as of :func:`estimate_latency`, or a motion that is not along one line.
-    """
-    video, tracker = _along_principal_axes(points), _along_principal_axes(positions)
-
-    def lag(one: np.ndarray, other: np.ndarray) -> Latency:
-        return estimate_latency(t_video, video @ one, t_tracker, tracker @ other)
-
-    along = np.eye(2)[0], np.eye(3)[0]
-    found = lag(*along)
-    variance = found.sd_s**2
-    for towards in np.eye(5)[[1, 3, 4]]:
-        tilt = _TILT * towards[:2], _TILT * towards[2:]
-        try:
-            ahead = lag(along[0] + tilt[0], along[1] + tilt[1]).lag_s
-            behind = lag(along[0] - tilt[0], along[1] - tilt[1]).lag_s
-        except InputError:
-            variance = np.inf
-            break
-        variance += ((ahead - behind) / 2) ** 2
-    if variance > LARGEST_LAG_SD_S**2:
-        raise InputError(
-            "the probe was not moved along one line, so the lag cannot be told: move it to and fro "
-            "along one line of the image"
-        )
-    return replace(found, sd_s=float(np.sqrt(variance)))
-
-
-@dataclass(frozen=True)
 class FittedLag:
     """The lag at which images of a target at rest fit the poses best.
 
     Attributes:
         lag_s: an image stamped t fits the pose at t - lag best.
-        sd_s: standard deviation of the lag, s; infinite at the edge of the search.
+        sd_s: standard deviation of the lag, s, if the errors lie along the motion; else it is
+            smaller. Infinite at the edge of the search.
         misfit_mm: root mean square distance of the images' targets from one place, at this lag.
         given_mm: the same without a lag.
         evidence: how much larger the sum of squares is without a lag, in variances of one image;
             the square of a standard normal if there is none.
+        contrast: the same of the lag that fits worst; small if the probe hardly moved.
+        rival_s: another lag that fits about as well, as in a periodic motion; None if none does.
     """
 
     lag_s: float
@@ -399,6 +315,8 @@ class FittedLag:
     misfit_mm: float
     given_mm: float
     evidence: float
+    contrast: float
+    rival_s: float | None
 
 
 def fitted_lag(
@@ -413,9 +331,12 @@ def fitted_lag(
     """Lag of the images behind the poses from a target at rest, whatever the probe's motion.
 
     At every lag up to ``LARGEST_LAG_S``, in both directions, the target's place and an affine map
-    from image to probe are fitted to the images by linear least squares. A parabola through the
-    least sum of squares and its neighbours refines the lag. A probe that is held still for each
-    image tells nothing: the evidence is then small.
+    from image to probe are fitted to the images by linear least squares. Parabolas refine the lags
+    at which the sum of squares is lowest. A probe that is held still for each image tells nothing:
+    the evidence is then small.
+
+    PLUS correlates one coordinate of the images and of the probe instead (Lasso et al. 2014, IEEE
+    Trans. Biomed. Eng. 61, 2527), which takes a motion along one line.
 
     Args:
         t_image: (n,) stamps of the images, s, on the tracker's clock.
@@ -433,7 +354,8 @@ def fitted_lag(
     """
     steps = round(LARGEST_LAG_S / _FIT_STEP_S)
     lags = np.arange(-steps, steps + 1) * _FIT_STEP_S
-    asked = np.asarray(t_image)[:, None] - lags
+    stamps = np.asarray(t_image)
+    asked = stamps[:, None] - lags
     # The same images at every lag: a lag with fewer images could win by chance.
     between = can_interpolate(t, asked.ravel(), max_gap_s=max_gap_s, valid=valid)
     rows = np.flatnonzero(between.reshape(asked.shape).all(axis=1))
@@ -441,87 +363,81 @@ def fitted_lag(
     if len(rows) < least:
         return None
     rows = rows[np.unique(np.linspace(0, len(rows) - 1, most).astype(int))]
-    found = interpolate_poses(t, poses, asked[rows].ravel(), max_gap_s=max_gap_s, valid=valid)
-    found = found.reshape(len(rows), len(lags), 4, 4)
     centred = np.asarray(points)[rows] - np.mean(np.asarray(points)[rows], axis=0)
     size = np.sqrt(np.mean(centred**2))
-    if not size > 0 or not np.ptp(np.asarray(t_image)[rows]) > 0:
+    lasting = float(np.ptp(stamps[rows]))
+    if not size > 0 or not lasting > 0:
         return None
     plane = np.column_stack([centred / size, np.ones(len(rows))])
-    squares = np.array([_affine_misfit(found[:, k], plane) for k in range(len(lags))])
+
+    def fitted_at(lags: Float[np.ndarray, " k"]) -> Float[np.ndarray, "k n 3"]:
+        asked = (stamps[rows, None] - lags).ravel()
+        found = interpolate_poses(t, poses, asked, max_gap_s=max_gap_s, valid=valid)
+        found = found.reshape(len(rows), len(lags), 4, 4)
+        return np.stack([_affine_residuals(found[:, k], plane) for k in range(len(lags))])
+
+    def squares_at(lags: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+        return np.sum(fitted_at(lags) ** 2, axis=(1, 2))
+
+    squares = squares_at(lags)
+    at_zero = squares[steps]
+    # Between two lags a fast motion may fit far better than at either.
+    bottoms = 1 + np.flatnonzero((squares[1:-1] <= squares[:-2]) & (squares[1:-1] < squares[2:]))
+    for bottom in bottoms:
+        near = _FIT_STEP_S * np.linspace(-1, 1, _FINE_STEPS)
+        closely = squares_at(lags[bottom] + near)
+        lowest = min(max(int(np.argmin(closely)), 2), _FINE_STEPS - 3)
+        part = slice(lowest - 2, lowest + 3)
+        bend, slope, level = np.polyfit(near[part] - near[lowest], closely[part], 2)
+        lags[bottom] += near[lowest]
+        squares[bottom] = closely[lowest]
+        if bend > 0 and abs(slope) < 2 * bend * _FIT_STEP_S:
+            lags[bottom] -= slope / (2 * bend)
+            squares[bottom] = level - slope**2 / (4 * bend)
     best = int(np.argmin(squares))
     # Most of the misfit is the target's distance from the image plane: one number an image. The
     # affine map, the target's place and the lag have 13 unknowns, for three coordinates an image.
     variance = squares[best] / (len(rows) - 13 / 3)
     # Errors of images taken at short intervals are alike, and count as fewer.
-    lasting = float(np.ptp(np.asarray(t_image)[rows]))
     variance *= max((len(rows) - 1) * LARGEST_LAG_S / lasting, 1.0)
-    lag, sd = float(lags[best]), np.inf
-    if 0 < best < len(lags) - 1:
-        bend, slope, _ = np.polyfit(
-            lags[best - 1 : best + 2] - lag, squares[best - 1 : best + 2], 2
-        )
-        if bend > 0:
-            lag, sd = lag - slope / (2 * bend), float(np.sqrt(variance / bend))
     if not variance > 0:
         return None
-    misfit, given = np.sqrt(squares[[best, steps]] / len(rows))
-    evidence = (squares[steps] - squares[best]) / variance
-    return FittedLag(float(lag), sd, float(misfit), float(given), float(evidence))
+    sd = np.inf
+    if best in bottoms:
+        # As wide as a hand's motion allows: the tracker's noise would pass for motion.
+        behind, ahead = fitted_at(lags[best] + _FIT_STEP_S * np.array([-1, 1]))
+        motion = np.sum((ahead - behind) ** 2)
+        sd = float(2 * _FIT_STEP_S * np.sqrt(variance / motion)) if motion > 0 else np.inf
+    misfit, given = np.sqrt([squares[best] / len(rows), at_zero / len(rows)])
+    evidence = (squares - squares[best]) / variance
+    return FittedLag(
+        float(lags[best]),
+        sd,
+        float(misfit),
+        float(given),
+        float((at_zero - squares[best]) / variance),
+        float(evidence.max()),
+        _rival(lags, evidence),
+    )
 
 
-def _affine_misfit(poses: Float[np.ndarray, "n 4 4"], plane: Float[np.ndarray, "n 3"]) -> float:
-    """Sum of squares of R M q + t - c over images; the matrix M and the place c are fitted."""
+def _rival(lags: Float[np.ndarray, " k"], above: Float[np.ndarray, " k"]) -> float | None:
+    """Another lag that fits about as well as the best one, behind lags that fit far worse."""
+    best = int(np.argmin(above))
+    for other in np.flatnonzero(above < LAG_EVIDENCE):
+        if above[min(best, other) : max(best, other) + 1].max() > 2 * LAG_EVIDENCE:
+            return float(lags[other])
+    return None
+
+
+def _affine_residuals(
+    poses: Float[np.ndarray, "n 4 4"], plane: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n 3"]:
+    """R M q + t - c of every image, mm; the matrix M and the place c are fitted."""
     turn, count = poses[:, :3, :3], len(poses)
     of_map = np.einsum("nij,nl->nijl", turn, plane).reshape(count, 3, 9)
     design = np.concatenate([of_map, np.tile(-np.eye(3), (count, 1, 1))], axis=2).reshape(-1, 12)
     # About the mean, whose distance from the tracker would cost digits.
     wanted = -(poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0)).ravel()
     solution = np.linalg.lstsq(design, wanted, rcond=None)[0]
-    return float(np.sum((design @ solution - wanted) ** 2))
-
-
-def _along_principal_axes(positions: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
-    """Positions along the directions in which they differ most, then next, ...; signs are free."""
-    centred = positions - positions.mean(axis=0)
-    return centred @ np.linalg.eigh(centred.T @ centred)[1][:, ::-1]
-
-
-def _peak(lags: np.ndarray, correlation: np.ndarray, samples: int) -> Latency:
-    strength = np.abs(correlation)
-    best = int(np.argmax(strength))
-    if strength[best] < _MINIMUM_CORRELATION:
-        raise InputError(
-            f"images and poses do not show the same motion (correlation {strength[best]:.2f})"
-        )
-    if best in (0, len(lags) - 1):
-        raise InputError(
-            f"the lag is {lags[best]:.3g} s or beyond, where the search ends: subtract about that "
-            "from the images' times, and estimate the rest"
-        )
-    middle = strength[1:-1]
-    tops = 1 + np.flatnonzero((middle >= strength[:-2]) & (middle > strength[2:]))
-    least = _RIVAL * strength[best]
-    for other in tops:
-        # The tracker's noise makes ripples on a broad peak: a rival has a valley in between.
-        valley = strength[min(best, other) : max(best, other) + 1].min()
-        if strength[other] > least > valley:
-            raise InputError(
-                f"lags of {lags[best]:.3f} and {lags[other]:.3f} s fit equally well: move the "
-                "probe less regularly"
-            )
-    # Interpolation between samples, and the tracker's noise, make kinks: the parabola is wider. By
-    # 0.99 of the peak, terms of higher order do not matter yet.
-    broad = np.flatnonzero(strength < _TOP * strength[best])
-    half = int(np.min(np.abs(broad - best), initial=len(lags))) - 1
-    half = min(max(half, _PARABOLA_STEPS), best, len(lags) - 1 - best)
-    near = slice(best - half, best + half + 1)
-    bend, slope, top = np.polyfit(lags[near] - lags[best], strength[near], 2)
-    if bend >= 0:
-        raise InputError("the correlation has no clear peak: move the probe farther or faster")
-    shift = float(np.clip(-slope / (2 * bend), -half * _LAG_STEP_S, half * _LAG_STEP_S))
-    # With unit signals, the lag's variance is that of the misfit, (1 - r^2) / n, divided by the
-    # power of the slope, (-r'' / r) r^2.
-    top = min(float(top), 1.0)
-    sd = float(np.sqrt((1 - top**2) / (samples * top * -2 * bend)))
-    return Latency(float(lags[best]) + shift, float(correlation[best]), sd)
+    return (design @ solution - wanted).reshape(count, 3)

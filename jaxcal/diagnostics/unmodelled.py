@@ -1,6 +1,6 @@
 """Would an error that the model leaves out explain the residuals better?
 
-Seven are looked for with a few parameters theta, linearised at the answer:
+Eight are looked for with a few parameters theta, linearised at the answer:
 
     scale   the pixels' sizes or the sound speed: x and r are too long by a share of themselves
     lateral the same of x alone, where the sound speed is estimated: a wrong width of the pixels, or
@@ -12,6 +12,9 @@ Seven are looked for with a few parameters theta, linearised at the answer:
             beside the target
     curve   ranges are too long by the square of the lateral position: an image of a curved array
             taken for that of a straight one, or delays that are wrong towards the sides
+    lag     images show what was earlier than their poses, of a probe in motion; where the probe's
+            velocities are known. Offsets do not count here either: a hand that moves the target
+            towards the image plane may stop too early every time
     beside  the target lies beside the image plane by m in all images, so ranges are too long by
             m^2 / (2 r), which hardly any other error imitates; theta = m^2
 
@@ -24,10 +27,10 @@ places where the step may be. Its limit was found by simulation: Gaussian errors
 exceed 22 once in a thousand recordings, and errors that grow with depth 26 as often as they exceed
 the limit of a slip. An answer within bounds is first moved to the optimum of Gaussian offsets.
 
-An eighth, a distortion of the tracked positions, has a random field instead of few parameters
+A ninth, a distortion of the tracked positions, has a random field instead of few parameters
 (:mod:`jaxcal.diagnostics.tracker_distortion`). Its limit is from simulations with errors that grow
 with depth as well. Half of it must be exceeded without any neighbourhood, too: a few neighbours
-with an error in common imitate a distortion. A ninth, a second target
+with an error in common imitate a distortion. A tenth, a second target
 or a second origin of the images (:mod:`jaxcal.diagnostics.second_target`), has a parameter for each
 image, which says which of the two it has. It goes first if it is the clearest in spite of the
 n ln 2 that these choices cost.
@@ -64,6 +67,7 @@ _BY_CHANCE = {
     "scale": 13.8,
     "lateral": 10.8,
     "slip": 16.3,
+    "lag": 10.8,
     "step": 26.0,
     "skew": 10.8,
     "curve": 10.8,
@@ -88,14 +92,15 @@ class Unmodelled:
     """An error that the model leaves out, and that the residuals show.
 
     Attributes:
-        kind: ``scale``, ``lateral``, ``slip``, ``step``, ``skew``, ``curve``, ``beside``,
+        kind: ``scale``, ``lateral``, ``slip``, ``step``, ``skew``, ``curve``, ``lag``, ``beside``,
             ``distortion``, ``targets`` or ``origins``.
         values: its parameters: by which shares lateral positions and ranges are too long; by which
             lateral positions alone; motion of X from the first image to the last (lateral and
             axial, mm; about y, rad); by which share of the depth lateral positions are too large;
-            by how many mm ranges are too long 20 mm to the side; the distance m in mm; the root
-            mean square distortion in mm; the distance between two targets in mm; by how much the
-            points of ``images`` are off laterally and axially, mm.
+            by how many mm ranges are too long 20 mm to the side; the lag of images behind poses in
+            s; the distance m in mm; the root mean square distortion in mm; the distance between
+            two targets in mm; by how much the points of ``images`` are off laterally and axially,
+            mm.
         statistic: 2 ln LR.
         step: by how much the unknowns would change if it were corrected; of a distortion, by one SD
             of each of its coefficients.
@@ -135,10 +140,12 @@ class Unmodelled:
         return size[0], size[1]
 
 
-def unmodelled(calibration: Calibration) -> list[Unmodelled]:
+def unmodelled(
+    calibration: Calibration, velocity: Float[Array, "n 6"] | None = None
+) -> list[Unmodelled]:
     """What the residuals of one calibration with concrete values show, the clearest first.
 
-    Only fits of points are looked at.
+    Only fits of points are looked at; ``velocity`` is that of a recording's images.
     """
     used = np.asarray(calibration.mask) > 0
     fewest = _FEWEST_CONVENTIONAL if calibration.method == "conventional" else FEWEST
@@ -154,6 +161,8 @@ def unmodelled(calibration: Calibration) -> list[Unmodelled]:
         seen = GaussianOffsets.of(answer).seen
     images, known = int(used.sum()), seen.rows.shape[-1]
     columns = _columns(seen, used)
+    if velocity is not None:
+        columns += _lag(answer, seen, used, velocity)
     with np.errstate(all="ignore"):
         errors, rows = shortened(*_in_sds(answer, seen, used, [each for _, _, each in columns]))
         before, _ = tuned(errors, rows[..., :known], images)
@@ -208,6 +217,25 @@ def _columns(
         after = np.where(np.arange(len(used)) < image, -0.5, 0.5)
         found.append(("step", int(image), after[:, None, None] * within))
     return [(kind, image, np.where(used[:, None, None], each, 0.0)) for kind, image, each in found]
+
+
+def _lag(
+    answer: Calibration, seen: ImageErrors, used: Bool[Array, " n"], velocity: Float[Array, "n 6"]
+) -> list[tuple[str, int | None, Float[Array, "n 3 1"]]]:
+    """The same by the lag of images behind their poses, s, where the probe moved.
+
+    An image shows what was earlier by the lag, at the pose times Exp(-lag [v, omega]).
+    """
+    transform = np.asarray(answer.image_to_probe)[0]
+    known = used & np.isfinite(velocity).all(axis=1)
+    v, omega = np.hsplit(np.where(known[:, None], velocity, 0.0), 2)
+    # Of the image, along and about its own axes.
+    v = (v + np.cross(omega, transform[:3, 3])) @ transform[:3, :3]
+    motion = np.hstack([v, omega @ transform[:3, :3]])
+    if not motion.any():
+        return []
+    rows = seen.rows[0][..., :6] * [[1.0], [1.0], [0.0]]
+    return [("lag", None, -np.einsum("nki,ni->nk", rows, motion)[..., None])]
 
 
 def _excess(

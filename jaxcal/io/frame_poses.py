@@ -44,8 +44,12 @@ def opened(
 ) -> tuple[TrackedSequence, TrackedSequence | None, list[str]]:
     """A sequence, and another with the poses alone, if they are to be matched to it by time."""
     if options.poses is None:
-        refuse(options, ("lag_s",), "needs --poses: a lag is between images and poses of two files")
-        return read_tracked(source, options.pose_units), None, []
+        sequence = read_tracked(source, options.pose_units)
+        if not options.lag_s:
+            return sequence, None, []
+        if isinstance(sequence.pixels, FolderPixels):
+            refuse(options, ("lag_s",), "needs --poses: a folder of images has no poses")
+        return sequence, *_one_tool(sequence, options)
     sequence = read_tracked(source)
     of_table = kind_of(options.poses) == "table"
     if of_table:
@@ -63,12 +67,18 @@ def opened(
     if of_table:
         table = read_rows(options.poses, options)
         return sequence, tracking_of_table(table, sequence), table.notes
-    tracking = read_tracked(options.poses, options.pose_units)
-    start, end, said = _frames(tracking, options)
-    poses, valid = tracking.poses(start, end)
+    return sequence, *_one_tool(read_tracked(options.poses, options.pose_units), options)
+
+
+def _one_tool(
+    sequence: TrackedSequence, options: ImportOptions
+) -> tuple[TrackedSequence, list[str]]:
+    """A sequence's poses between the frames that are asked for, and what was assumed."""
+    start, end, notes = _frames(sequence, options)
+    poses, valid = sequence.poses(start, end)
     poses = inverse_poses(poses) if options.invert_poses else poses
     pair = start, end
-    return sequence, replace(tracking, transforms={pair: poses}, valid={pair: valid}), said
+    return replace(sequence, transforms={pair: poses}, valid={pair: valid}, pixels=None), notes
 
 
 def tracking_of_table(table: PoseTable, images: TrackedSequence) -> TrackedSequence:
@@ -98,16 +108,16 @@ def tracked_poses(
     Raises:
         InputError: no way between the frames, or no frame with tracking.
     """
-    if options.poses is None:
-        start, end, notes = _frames(sequence, options)
-    else:
+    if options.by_time:
         # The assumptions were noted, and poses inverted, when the poses were matched.
         (start, end), notes = next(iter(sequence.transforms)), []
+    else:
+        start, end, notes = _frames(sequence, options)
     poses, valid = sequence.poses(start, end)
-    if options.invert_poses and options.poses is None:
+    if options.invert_poses and not options.by_time:
         poses = inverse_poses(poses)
     lost = len(sequence) - int(valid.sum())
-    if lost and options.poses is None:
+    if lost and not options.by_time:
         notes.append(f"{lost} of {len(sequence)} frames left out: their tracking was not OK")
     if not valid.any():
         raise InputError(f"{sequence.source}: no frame has tracking from {start} to {end}")

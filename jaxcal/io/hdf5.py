@@ -8,7 +8,8 @@
                  point (n, 2) [mm: lateral, range], pixel (n, 2) [px: u lateral, v axial],
                  time_of_flight (n, elements) [s, one-way, NaN = no response; needs /probe];
                  optional covariance (n, 2, 2) [mm^2, px^2 for pixels], amplitude (n,),
-                 mask (n,) bool, time (n,) [s], max_elevation (n,) [mm],
+                 mask (n,) bool, time (n,) [s], velocity (n, 6) [mm/s, rad/s; in the probe's frame;
+                 NaN where it is not known], max_elevation (n,) [mm],
                  frame (n,): numbers of the frames in the file that the images came from;
                  pixel has attrs spacing_mm [lateral, axial], face_offset_mm and frame_size
                  [columns, rows], point has face_offset_mm, all optional;
@@ -77,11 +78,13 @@ GROUPS = ("probe", "calibration", "test", "truth", "segmentation")
 
 _MOST_GROUPS = 1000
 
+_VELOCITY = "mm/s, rad/s"
 _SPELLINGS = {
     "mm": ("mm", "millimeter", "millimeters", "millimetre", "millimetres"),
     "px": ("px", "pixel", "pixels"),
     "s": ("s", "second", "seconds"),
     "mm^2": ("mm^2", "mm2", "mm**2", "mm²"),
+    _VELOCITY: (_VELOCITY,),
     "px^2": ("px^2", "px2", "px**2", "px²"),
 }
 # Dimensionless, or of any unit: written as "1" and not compared.
@@ -258,6 +261,7 @@ def _read_images(root: Node, name: str, probe: Probe | None, minimum: int) -> Im
         kind,
         mask=_dataset(node, "mask", (IMAGES,), _FREE, kinds="biu"),
         covariance=_dataset(node, "covariance", (IMAGES, 2, 2), _area(kind)),
+        velocity=_dataset(node, "velocity", (IMAGES, 6), _VELOCITY),
         spacing_mm=spacing,
         face_offset_mm=offset,
         frame_size=size,
@@ -376,7 +380,12 @@ def _write_images(target: h5py.Group, images: Images) -> None:
         measurements.attrs["face_offset_mm"] = images.face_offset_mm
         if images.frame_size is not None:
             measurements.attrs["frame_size"] = images.frame_size
-    optional = {"time_of_flight": "s", "mask": _FREE, "covariance": _area(images.kind)}
+    optional = {
+        "time_of_flight": "s",
+        "mask": _FREE,
+        "covariance": _area(images.kind),
+        "velocity": _VELOCITY,
+    }
     for name, unit in (optional | _PER_IMAGE).items():
         values = getattr(images, name)
         if values is not None:

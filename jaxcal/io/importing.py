@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -20,7 +20,7 @@ from jaxcal import InputError
 from jaxcal.data.recording import MetresError, Recording, make_images
 from jaxcal.io.frame_points import FramePoints, points_of_markups, points_of_table
 from jaxcal.io.frame_poses import opened, tracked_poses
-from jaxcal.io.poses_by_time import better_lag, lag_of_points, with_poses_by_time
+from jaxcal.io.poses_by_time import PoseTrack, better_lag, lag_of_points, with_poses_by_time
 from jaxcal.io.sequence import Pixels, TrackedSequence
 from jaxcal.io.sources import SEQUENCES, ImportOptions, kind_of, read_rows, refuse
 from jaxcal.io.table import first_line, parse_numbers, read_table
@@ -73,12 +73,13 @@ def import_files(
         return _from_sequence(sources, tracked, options)
     if options.poses is not None:
         raise InputError("--poses goes with a sequence or a folder of PNG images")
-    unused = "source", "target", "lag_s", "points", "target_kind", "region", "orientation"
+    unused = "source", "target", "points", "target_kind", "region", "orientation"
     refuse(options, unused, "does not go with a table of poses and points: it is for sequences")
     options = replace(options, spacing_mm=_spacing(None, options), spacing_from=None)
     if len(sources) == 2 and "markups" not in kinds and _have_headers(sources):
         tables = [read_rows(each, options, ignore_time=options.ignore_time) for each in sources]
-        return _from_table(*one_of_two_tables(*tables), options)
+        return _from_table(*one_of_two_tables(*tables, lag_s=options.lag_s), options)
+    refuse(options, ("lag_s",), "is for poses that are matched to images by their times")
     if len(sources) == 2 and "markups" not in kinds:
         if options.units == "mm":
             raise InputError("a pair of text files holds pixels: --units mm does not go with it")
@@ -117,6 +118,9 @@ def _from_table(table: PoseTable, notes: list[str], lost: int, options: ImportOp
     if table.time is not None:
         time, said = _good_time(table.time, lambda row: f"{table.name}:{table.lines[row]}", options)
         table, notes = replace(table, time=time), notes + said
+        if time is not None and table.poses is not None and table.velocity is None:
+            track = PoseTrack.of_table(time, table.poses, table.name)
+            table = replace(table, velocity=track.velocities(time))
     with _naming_pose_units(options, table.length_stated):
         recording = recording_of(table, options.spacing_mm, options.minimum)
     return Imported(recording, notes, most_lost=len(table) < lost)
@@ -172,15 +176,22 @@ def _from_sequence(
     _refuse_unused(points, options)
     sequence, tracking, notes = opened(tracked[0], options)
     placed = None if points is None else _points(points, sequence, options)
-    results, lag_s = None, options.lag_s
+    results, lag_s, track = None, options.lag_s, None
     if tracking is not None:
+        track = PoseTrack.of(tracking)
         if lag_s == "auto":
-            lag_s, note, results = _estimated_lag(sequence, placed, tracking, options)
+            lag_s, note, results = _estimated_lag(sequence, placed, track, options)
             notes.append(note)
         sequence, said = with_poses_by_time(sequence, tracking, lag_s)
         notes += said
+    assert lag_s != "auto"
     poses, valid, frames, said = tracked_poses(sequence, options)
     notes += said
+    if track is None:
+        with suppress(InputError):
+            track = PoseTrack.of(
+                replace(sequence, transforms={frames: poses}, valid={frames: valid})
+            )
     spacing = _spacing(sequence, options)
     with _naming_pose_units(options, sequence.length_stated):
         where = sequence.source
@@ -197,12 +208,15 @@ def _from_sequence(
             notes += placed.notes + _mirrored(sequence, points)
             used = _usable_points(sequence, placed, valid)
             given, what = len(placed.rows), "points"
-        time, said = None, []
-        if tracking is not None and options.lag_s != "auto":
-            notes += better_lag(sequence.time[used.rows], used.points, tracking, options.lag_s)
-        if np.isfinite(sequence.time[used.rows]).all():
+        time, velocity, said = None, None, []
+        stamps = sequence.time[used.rows]
+        if np.isfinite(stamps).all():
+            if track is not None:
+                velocity = track.velocities(stamps - lag_s)
+                if options.lag_s != "auto":
+                    notes += better_lag(stamps, used.points, track, lag_s)
             time, said = _good_time(
-                sequence.time[used.rows],
+                stamps,
                 lambda row: f"{sequence.source}: {sequence.frame_name(int(used.rows[row]))}",
                 options,
                 by_time=tracking is not None,
@@ -215,6 +229,7 @@ def _from_sequence(
             used.kind,
             covariance=used.covariance,
             time=time,
+            velocity=velocity,
             spacing_mm=spacing,
             frame=sequence.numbers_of(used.rows),
             frame_size=size if used.kind == "pixel" else None,
@@ -234,7 +249,7 @@ def _from_sequence(
 def _estimated_lag(
     sequence: TrackedSequence,
     placed: FramePoints | None,
-    tracking: TrackedSequence,
+    track: PoseTrack,
     options: ImportOptions,
 ) -> tuple[float, str, FrameResults | None]:
     """The lag and a note, and the target in all frames if it had to be looked for."""
@@ -245,7 +260,7 @@ def _estimated_lag(
     else:
         shown = _shown(sequence, placed.rows)
         rows, points = placed.rows[shown], placed.points[shown]
-    return *lag_of_points(sequence, rows, points, tracking), results
+    return *lag_of_points(sequence.time[rows], points, track), results
 
 
 def _refuse_unused(points: str | os.PathLike[str] | None, options: ImportOptions) -> None:

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.data.poses import check_poses
 from jaxcal.data.timing import (
+    LAG_EVIDENCE,
+    LARGEST_LAG_S,
+    LARGEST_LAG_SD_S,
+    FittedLag,
     can_interpolate,
     fitted_lag,
     interpolate_poses,
     interpolation_error,
-    latency_of_positions,
+    pose_velocities,
 )
 from jaxcal.io.sequence import TrackedSequence
 from jaxcal.io.text import PoseTable
-from jaxcal.runtime.array_types import Float, Int
+from jaxcal.runtime.array_types import Bool, Float
 from jaxcal.runtime.messages import seconds
 
 LONGEST_GAP = 5.0
@@ -29,10 +32,97 @@ _SHARED = 0.2
 1.25 intervals between poses."""
 _TOLD_MM = 0.5
 """Larger errors of interpolation are told; the noise of a tracker looks like smaller ones."""
-_LAG_EVIDENCE = 25.0
-"""A lag is told if its evidence is larger: a normal variable's square at 5 SD."""
+_LONGEST_GAP_OF_VELOCITY_S = 0.25
+"""Longest time between two poses from which a velocity is taken."""
 _ROUNDED_S = 1e-6
 """Times that were written as text and read again may be off by so much."""
+
+
+@dataclass(frozen=True)
+class PoseTrack:
+    """Poses of which the times are known and increase.
+
+    Attributes:
+        time: s.
+        poses: probe -> tracker, mm.
+        valid: False where a pose cannot be used.
+        interval_s: median time between them.
+        source: the file.
+    """
+
+    time: Float[np.ndarray, " m"]
+    poses: Float[np.ndarray, "m 4 4"]
+    valid: Bool[np.ndarray, " m"]
+    interval_s: float
+    source: str
+
+    @property
+    def gap_s(self) -> float:
+        """Longest time between two poses that is bridged."""
+        return LONGEST_GAP * self.interval_s
+
+    @classmethod
+    def of(cls, tracking: TrackedSequence) -> PoseTrack:
+        """The poses of a sequence that holds those of one tool only.
+
+        Raises:
+            InputError: no times, times that go back, or the same time for many different poses.
+        """
+        ((pair, poses),) = tracking.transforms.items()
+        source, time, usable = tracking.source, tracking.time, tracking.valid[pair]
+        known = np.flatnonzero(np.isfinite(time))
+        if len(known) < 2:
+            raise InputError(
+                f"{source}: states no times: its poses cannot be matched to the images"
+            )
+        steps = np.diff(time[known])
+        back = np.flatnonzero(steps < 0)
+        if len(back):
+            raise InputError(
+                f"{source}: the time stamp of pose {back[0] + 1} is before the one before it: two "
+                "recordings in one?"
+            )
+        # A tracker that was asked faster than it measures gives the same pose twice.
+        kept = known[np.concatenate([[True], steps > 0])]
+        if len(kept) < 2:
+            raise InputError(f"{source}: all its poses have one time stamp")
+        good = known[usable[known]]
+        moved = (poses[good[1:]] != poses[good[:-1]]).any(axis=(1, 2))
+        shared = int((moved & (time[good[1:]] == time[good[:-1]])).sum())
+        if shared > _SHARED * len(good):
+            raise InputError(
+                f"{source}: {shared} of {len(good)} poses have the time stamp of the pose before, "
+                "but differ from it: were times written with too few digits, or poses stamped in "
+                "groups?"
+            )
+        interval = float(np.median(np.diff(time[kept])))
+        return cls(time[kept], poses[kept], usable[kept], interval, source)
+
+    @classmethod
+    def of_table(
+        cls, time: Float[np.ndarray, " m"], poses: Float[np.ndarray, "m 4 4"], source: str
+    ) -> PoseTrack:
+        """Poses that can all be used, at times, s, that increase."""
+        return cls(time, poses, np.ones(len(time), bool), float(np.median(np.diff(time))), source)
+
+    def velocities(self, time: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 6"] | None:
+        """How the probe moved at these times (:func:`pose_velocities`); None if it is not known."""
+        found = pose_velocities(
+            self.time,
+            self.poses,
+            time,
+            max_gap_s=min(self.gap_s, _LONGEST_GAP_OF_VELOCITY_S),
+            valid=self.valid,
+        )
+        return found if np.isfinite(found).any() else None
+
+    def lag_of(
+        self, time: Float[np.ndarray, " n"], points: Float[np.ndarray, "n 2"]
+    ) -> FittedLag | None:
+        """The lag at which the points of images stamped so fit best (:func:`fitted_lag`)."""
+        return fitted_lag(
+            time, points, self.time, self.poses, max_gap_s=self.gap_s, valid=self.valid
+        )
 
 
 def times_of_table(table: PoseTable, sequence: TrackedSequence) -> Float[np.ndarray, " m"]:
@@ -73,36 +163,33 @@ def with_poses_by_time(
         InputError: images or poses without times, times that go back, no image between poses, or
             times of poses that are taken for seconds, though hardly any could be of the images.
     """
-    source = tracking.source
-    ((pair, poses),) = tracking.transforms.items()
+    track = PoseTrack.of(tracking)
     if untimed := int((~np.isfinite(images.time)).sum()):
         raise InputError(
             f"{images.source}: {untimed} of {len(images)} images have no time stamp, so their "
-            f"poses cannot be looked up in {source}"
+            f"poses cannot be looked up in {track.source}"
         )
-    kept = _increasing(tracking)
-    time, poses, valid = tracking.time[kept], poses[kept], tracking.valid[pair][kept]
-    interval = float(np.median(np.diff(time)))
     if not tracking.time_stated:
-        _check_unit(images, time, interval, source)
-    gap = LONGEST_GAP * interval
+        _check_unit(images, track)
+    time, poses, valid, gap = track.time, track.poses, track.valid, track.gap_s
     asked = _within(images.time - lag_s, time[valid])
     between = can_interpolate(time, asked, max_gap_s=gap, valid=valid)
     if not between.any():
         raise InputError(
-            f"{images.source}: no image lies between poses of {source}: images are from "
+            f"{images.source}: no image lies between poses of {track.source}: images are from "
             f"{seconds(asked.min())} to {seconds(asked.max())}, poses from {seconds(time[0])} to "
             f"{seconds(time[-1])}: do they use the same clock?"
         )
     found = np.full((len(images), 4, 4), np.nan)
     found[between] = interpolate_poses(time, poses, asked[between], max_gap_s=gap, valid=valid)
-    notes = [f"poses of {source} at the images' times" + (f" less {lag_s:g} s" if lag_s else "")]
+    less = f" less {lag_s:g} s" if lag_s else ""
+    notes = [f"poses of {track.source} at the images' times{less}"]
     cost = interpolation_error(time[valid], poses[valid], asked[between], max_gap_s=gap)
     if cost > _TOLD_MM:
         notes.append(
-            f"poses are {interval:.3g} s apart, and the probe moves between them: interpolated "
-            f"poses are wrong by about {cost:.1f} mm (RMS, from leaving poses out); record poses "
-            "more often, or hold the probe still for each image"
+            f"poses are {track.interval_s:.3g} s apart, and the probe moves between them: "
+            f"interpolated poses are wrong by about {cost:.1f} mm (RMS, from leaving poses out); "
+            "record poses more often, or hold the probe still for each image"
         )
     lost = int((~between).sum())
     if lost:
@@ -112,8 +199,8 @@ def with_poses_by_time(
         )
     return replace(
         images,
-        transforms={pair: found},
-        valid={pair: between},
+        transforms=dict.fromkeys(tracking.transforms, found),
+        valid=dict.fromkeys(tracking.transforms, between),
         length_stated=tracking.length_stated,
         without_status=(),
     ), notes
@@ -122,52 +209,87 @@ def with_poses_by_time(
 def better_lag(
     time: Float[np.ndarray, " n"],
     points: Float[np.ndarray, "n 2"],
-    tracking: TrackedSequence,
-    lag_s: float | None = 0.0,
+    track: PoseTrack,
+    lag_s: float,
 ) -> list[str]:
-    """A note if another lag fits the points far better than the one that was used.
+    """A note if another lag fits the points far better than ``lag_s``, which was used.
 
     Args:
-        time: of the images, s, on the clock of ``tracking``.
+        time: of the images, s, on the clock of the poses.
         points: the target in them, px or mm.
-        tracking: the poses alone, which :func:`with_poses_by_time` has taken.
-        lag_s: the lag that was used; None if times have to be changed to state one.
+        track: all poses.
+        lag_s: by which images lag behind poses.
     """
-    ((pair, poses),) = tracking.transforms.items()
-    kept = _increasing(tracking)
-    times, valid, given = tracking.time[kept], tracking.valid[pair][kept], lag_s or 0.0
-    gap = LONGEST_GAP * float(np.median(np.diff(times)))
-    poses = poses[kept]
-    found = fitted_lag(time - given, points, times, poses, max_gap_s=gap, valid=valid)
-    if found is None or found.evidence <= _LAG_EVIDENCE:
+    found = track.lag_of(time - lag_s, points)
+    if found is None or found.evidence <= LAG_EVIDENCE:
         return []
-    told = given + found.lag_s
+    told = lag_s + found.lag_s
     sure, state = f" (SD {found.sd_s:.2g} s)", f"state it (--lag {told:.3f})"
     if not np.isfinite(found.sd_s):
         sure, state = ", where the search ends,", "do images and poses use the same clock?"
-    elif lag_s is None:
-        change = ("subtract", "from") if told > 0 else ("add", "to")
-        state = f"{change[0]} {abs(told):.3f} s {change[1]} the images' times"
     return [
-        f"the points fit the poses better at a lag of {told:.3f} s{sure} than at {given:g} s: the "
+        f"the points fit the poses better at a lag of {told:.3f} s{sure} than at {lag_s:g} s: the "
         f"target comes out within {found.misfit_mm:.2g} mm of one place (RMS), not "
         f"{found.given_mm:.2g} mm; {state}, or hold the probe still for each image"
     ]
 
 
-def _check_unit(
-    images: TrackedSequence, time: Float[np.ndarray, " m"], interval: float, source: str
-) -> None:
+def lag_of_points(
+    time: Float[np.ndarray, " n"], points: Float[np.ndarray, "n 2"], track: PoseTrack
+) -> tuple[float, str]:
+    """By how much images lag behind poses, from a target at rest in images of a moving probe.
+
+    The arguments are those of :func:`better_lag`.
+
+    Returns:
+        The lag, s, and a note for the user.
+
+    Raises:
+        InputError: too few images, too little motion, a lag where the search ends, or several that
+            fit equally well.
+    """
+    found = track.lag_of(time, points)
+    if found is None:
+        raise InputError(
+            "--lag auto: too few images show the target with poses from "
+            f"{LARGEST_LAG_S:g} s before to {LARGEST_LAG_S:g} s after them (or state the lag: "
+            "--lag SECONDS)"
+        )
+    if found.rival_s is not None:
+        why = (
+            f"lags of {found.lag_s:.3f} and {found.rival_s:.3f} s fit equally well: move the "
+            "probe less regularly"
+        )
+    elif not np.isfinite(found.sd_s) and found.contrast > LAG_EVIDENCE:
+        why = (
+            f"the lag is {found.lag_s:.3g} s or beyond, where the search ends: subtract about "
+            "that from the images' times, and estimate the rest"
+        )
+    elif found.sd_s > LARGEST_LAG_SD_S:
+        why = (
+            f"the images do not tell the lag (SD {found.sd_s:.2g} s, at most {LARGEST_LAG_SD_S:g} "
+            "s is needed): move the probe farther or faster, or take more images"
+        )
+    else:
+        return found.lag_s, (
+            f"images lag by {found.lag_s:.4f} s behind poses (SD {found.sd_s:.2g} s), estimated "
+            f"from {len(points)} points: the target comes out within {found.misfit_mm:.2g} mm of "
+            "one place (RMS)"
+        )
+    raise InputError(f"--lag auto: {why} (or state the lag: --lag SECONDS)")
+
+
+def _check_unit(images: TrackedSequence, track: PoseTrack) -> None:
     """Refuse a tracking that is far longer than the images and slower: its times may be in ms."""
-    covered, whole = float(np.ptp(images.time)), float(time[-1] - time[0])
+    covered, whole = float(np.ptp(images.time)), float(track.time[-1] - track.time[0])
     if len(images) < 2 or covered >= _SHORT * whole:
         return
     of_images = float(np.median(np.diff(np.sort(images.time))))
-    if interval > of_images:
+    if track.interval_s > of_images:
         raise InputError(
-            f"{source}: its poses last {whole:.4g} s, one every {interval:.3g} s, the images "
-            f"{covered:.3g} s, one every {of_images:.3g} s: is its time in ms, us or ns? State the "
-            "unit in the header: time [ms], [us], [ns], or [s]"
+            f"{track.source}: its poses last {whole:.4g} s, one every {track.interval_s:.3g} s, "
+            f"the images {covered:.3g} s, one every {of_images:.3g} s: is its time in ms, us or "
+            "ns? State the unit in the header: time [ms], [us], [ns], or [s]"
         )
 
 
@@ -177,69 +299,3 @@ def _within(asked: Float[np.ndarray, " n"], time: Float[np.ndarray, " m"]) -> np
         return asked
     nearest = np.clip(asked, time[0], time[-1])
     return np.where(np.abs(asked - nearest) <= _ROUNDED_S, nearest, asked)
-
-
-def _increasing(tracking: TrackedSequence) -> Int[np.ndarray, " k"]:
-    """The poses whose times are stated and later than the one before."""
-    source, time = tracking.source, tracking.time
-    known = np.flatnonzero(np.isfinite(time))
-    if len(known) < 2:
-        raise InputError(f"{source}: states no times: its poses cannot be matched to the images")
-    steps = np.diff(time[known])
-    back = np.flatnonzero(steps < 0)
-    if len(back):
-        raise InputError(
-            f"{source}: the time stamp of pose {back[0] + 1} is before the one before it: two "
-            "recordings in one?"
-        )
-    # A tracker that was asked faster than it measures gives the same pose twice.
-    kept = known[np.concatenate([[True], steps > 0])]
-    if len(kept) < 2:
-        raise InputError(f"{source}: all its poses have one time stamp")
-    ((pair, poses),) = tracking.transforms.items()
-    good = known[tracking.valid[pair][known]]
-    moved = (poses[good[1:]] != poses[good[:-1]]).any(axis=(1, 2))
-    shared = int((moved & (time[good[1:]] == time[good[:-1]])).sum())
-    if shared > _SHARED * len(good):
-        raise InputError(
-            f"{source}: {shared} of {len(good)} poses have the time stamp of the pose before, but "
-            "differ from it: were times written with too few digits, or poses stamped in groups?"
-        )
-    return kept
-
-
-def lag_of_points(
-    images: TrackedSequence,
-    rows: Int[np.ndarray, " n"],
-    points: Float[np.ndarray, "n 2"],
-    tracking: TrackedSequence,
-) -> tuple[float, str]:
-    """By how much images lag behind poses, from the motion of a target at rest in the images.
-
-    It was found at ``points`` (px or mm) in the frames ``rows``.
-
-    Returns:
-        The lag, s, and a note for the user.
-
-    Raises:
-        InputError: times missing, too little motion, or motions that do not agree; see
-            :func:`jaxcal.data.timing.latency_of_positions`.
-    """
-    ((pair, poses),) = tracking.transforms.items()
-    kept = _increasing(tracking)
-    kept = kept[tracking.valid[pair][kept]]
-    order = np.argsort(rows)
-    try:
-        if not len(kept) or not len(rows):
-            raise InputError("there are no poses, or no points")
-        positions = check_poses(poses[kept])[:, :3, 3]
-        found = latency_of_positions(
-            images.time[rows[order]], points[order], tracking.time[kept], positions
-        )
-    except InputError as error:
-        raise InputError(f"--lag auto: {error} (or state the lag: --lag SECONDS)") from None
-    return found.lag_s, (
-        f"images lag by {found.lag_s:.4f} s behind poses (SD {found.sd_s:.2g} s), estimated from "
-        f"{len(rows)} points: their motion has a correlation of {abs(found.correlation):.2f} with "
-        "the probe's"
-    )

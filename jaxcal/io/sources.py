@@ -45,8 +45,7 @@ class ImportOptions:
         ignore_time: time stamps that repeat, go back or are missing are no error: none are kept.
         poses: file with the poses of the frames: a table for a folder of images; a sequence, a
             tracker's export or a table with times for a sequence.
-        lag_s: with ``poses``: an image stamped t shows what was at t - lag; ``auto``: estimated
-            from the motion of the points in the images.
+        lag_s: an image stamped t shows what was at t - lag; ``auto``: estimated from the points.
         spacing_from: DICOM clip that states the pixel size.
         minimum: least number of images.
     """
@@ -68,6 +67,11 @@ class ImportOptions:
     lag_s: float | Literal["auto"] = 0.0
     spacing_from: str | os.PathLike[str] | None = None
     minimum: int = MINIMUM_IMAGES
+
+    @property
+    def by_time(self) -> bool:
+        """Whether frames do not have the poses that stand with them in their file."""
+        return self.poses is not None or self.lag_s != 0
 
 
 _FLAGS = {"source": "--from", "target": "--to", "target_kind": "--target", "lag_s": "--lag"}

@@ -64,6 +64,7 @@ class PoseTable:
         kind: of the points.
         time: (n,) s.
         clock: the date from which times count; None where they are numbers.
+        velocity: (n, 6) mm/s and rad/s, of the probe at these times, if poses were looked up.
         frame: (n,) number of the image.
         file: n names of images' files.
         skipped: rows that were left out as invalid.
@@ -78,6 +79,7 @@ class PoseTable:
     kind: Literal["pixel", "point"] = "pixel"
     time: Float[np.ndarray, " n"] | None = None
     clock: datetime | None = None
+    velocity: Float[np.ndarray, "n 6"] | None = None
     frame: Int[np.ndarray, " n"] | None = None
     file: tuple[str, ...] | None = None
     skipped: int = 0
@@ -178,6 +180,7 @@ def recording_of(
         table.points,
         table.kind,
         time=table.time,
+        velocity=table.velocity,
         spacing_mm=spacing_mm,
         frame=table.frame,
         minimum=minimum,

@@ -5,31 +5,40 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 
 from jaxcal import InputError
 from jaxcal.io.frame_poses import tracking_of_table
-from jaxcal.io.poses_by_time import better_lag, with_poses_by_time
+from jaxcal.io.poses_by_time import PoseTrack, better_lag, lag_of_points, with_poses_by_time
 from jaxcal.io.sequence import TrackedSequence
 from jaxcal.io.text import PoseTable
 from jaxcal.runtime.array_types import Bool, Float
 from jaxcal.runtime.messages import counted
 
 
-def one_of_two_tables(first: PoseTable, second: PoseTable) -> tuple[PoseTable, list[str], int]:
+def one_of_two_tables(
+    first: PoseTable, second: PoseTable, *, lag_s: float | Literal["auto"] = 0.0
+) -> tuple[PoseTable, list[str], int]:
     """The points of one table with the poses of the other, in the order of the points.
 
     Rows belong together by a column ``file`` or ``frame`` that both tables have; else by time, and
     poses are interpolated; else in their order, if there are as many poses as points and the table
     of points names neither file nor frame nor time.
 
+    Args:
+        first: one of the two tables.
+        second: the other one.
+        lag_s: of rows that are matched by time: a point stamped t was seen at t - lag; ``auto``:
+            estimated from the points.
+
     Returns:
         The table, notes for the user, and how many points were left out because they have no pose.
 
     Raises:
-        InputError: not poses in one table and points in the other, rows that cannot be matched, or
-            two poses of one image.
+        InputError: not poses in one table and points in the other, rows that cannot be matched,
+            two poses of one image, or a lag of rows that are not matched by time.
     """
     poses, points = (first, second) if first.poses is not None else (second, first)
     if poses.poses is None or points.points is None or (poses.points, points.poses) != (None, None):
@@ -37,7 +46,7 @@ def one_of_two_tables(first: PoseTable, second: PoseTable) -> tuple[PoseTable, l
             f"{first.name} and {second.name}: one table must hold the poses, the other one the "
             "points (u and v, or lateral and range); a table with both is imported by itself"
         )
-    found, has_pose, said = _poses_of(poses, points)
+    found, has_pose, velocity, said = _poses_of(poses, points, lag_s)
     lost = int((~has_pose).sum())
     if lost == len(points):
         raise InputError(f"{points.name}: {poses.name} has the pose of none of its points")
@@ -51,6 +60,7 @@ def one_of_two_tables(first: PoseTable, second: PoseTable) -> tuple[PoseTable, l
         name=f"{poses.name} with {points.name}",
         lines=[points.lines[row] for row in kept],
         poses=found[kept],
+        velocity=None if velocity is None else velocity[kept],
         length_stated=poses.length_stated,
         **chosen,
     )
@@ -58,9 +68,14 @@ def one_of_two_tables(first: PoseTable, second: PoseTable) -> tuple[PoseTable, l
 
 
 def _poses_of(
-    poses: PoseTable, points: PoseTable
-) -> tuple[Float[np.ndarray, "n 4 4"], Bool[np.ndarray, " n"], list[str]]:
-    """A pose for each point, whether it has one, and notes."""
+    poses: PoseTable, points: PoseTable, lag_s: float | Literal["auto"]
+) -> tuple[
+    Float[np.ndarray, "n 4 4"],
+    Bool[np.ndarray, " n"],
+    Float[np.ndarray, "n 6"] | None,
+    list[str],
+]:
+    """A pose for each point, whether it has one, the probe's velocities if known, and notes."""
     assert poses.poses is not None
     assert points.points is not None
     for names in (_file_names, _frame_numbers):
@@ -70,23 +85,36 @@ def _poses_of(
             rows = np.array([places.get(image, -1) for image in _rows_by_image(points, wanted)])
             lost = counted(int((rows < 0).sum()), "point")
             said = [f"{lost} left out: {poses.name} has no pose of that image"]
-            return poses.poses[rows], rows >= 0, said * bool((rows < 0).any())
+            _refuse_lag(lag_s)
+            return poses.poses[rows], rows >= 0, None, said * bool((rows < 0).any())
     if poses.time is not None and points.time is not None:
         everywhere = np.ones(len(points), bool)
         images = TrackedSequence(
             {}, {}, points.time, everywhere, source=points.name, clock=points.clock
         )
         tracking = tracking_of_table(poses, images)
-        images, said = with_poses_by_time(images, tracking)
+        track = PoseTrack.of(tracking)
+        if lag_s == "auto":
+            lag_s, told = lag_of_points(points.time, points.points, track)
+            notes = [told]
+        else:
+            notes = better_lag(points.time, points.points, track, lag_s)
+        images, said = with_poses_by_time(images, tracking, lag_s)
         (found,), (valid,) = images.transforms.values(), images.valid.values()
-        return found, valid, said + better_lag(points.time, points.points, tracking, None)
+        return found, valid, track.velocities(points.time - lag_s), said + notes
+    _refuse_lag(lag_s)
     unnamed = points.file is None and points.frame is None and points.time is None
     if unnamed and len(poses) == len(points):
-        return poses.poses, np.ones(len(points), bool), []
+        return poses.poses, np.ones(len(points), bool), None, []
     raise InputError(
         f"{points.name}: which pose of {poses.name} belongs to which point? Give both tables a "
         "column frame, file or time (without one, as many poses as points, in the same order)"
     )
+
+
+def _refuse_lag(lag_s: float | Literal["auto"]) -> None:
+    if lag_s:
+        raise InputError("--lag is for poses that are matched by time, with times in both tables")
 
 
 def _file_names(table: PoseTable) -> list[str] | None:

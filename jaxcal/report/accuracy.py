@@ -81,7 +81,7 @@ def accuracy_record(
     ratio, chance = excess(found, weight)
     tre["residuals_over_stated"] = math.sqrt(ratio) if ratio > 0 else None
     tre["chance"] = chance
-    tre["unmodelled"] = _unmodelled(answer, grid)
+    tre["unmodelled"] = _unmodelled(answer, grid, recording.calibration.velocity)
     away = away_from_gaussian(answer, grid)
     tre["gaussian_offsets"] = away and dict(zip(("apart_mm", "error_mm"), away, strict=True))
     agreeing = agreeing_outliers(answer, float(tre["stated_mm"]), grid)
@@ -211,9 +211,11 @@ def scatter_shares(answer: Calibration) -> Float[np.ndarray, " kinds"]:
     return squares / whole if whole > 0 else np.full(len(KINDS), np.nan)
 
 
-def _unmodelled(answer: Calibration, grid: Float[np.ndarray, "m 2"]) -> dict[str, Any] | None:
+def _unmodelled(
+    answer: Calibration, grid: Float[np.ndarray, "m 2"], velocity: Float[np.ndarray, "n 6"] | None
+) -> dict[str, Any] | None:
     """The clearest error that the model leaves out, and how far it moves the image."""
-    found = unmodelled(answer)
+    found = unmodelled(answer, velocity)
     if not found:
         return None
     # One imitates another: only the clearest is told.

@@ -196,6 +196,12 @@ def _from_unmodelled(record: dict[str, Any]) -> list[tuple[float, str]]:
             f"{found['image']} (counted from 0) would explain the errors far better: has the mount "
             "slipped there, or the target moved? Calibrate from the images before it, or after it"
         ),
+        "lag": lambda: (
+            f"{'images' if values[0] > 0 else 'poses'} that lag {abs(values[0]):.3f} s behind "
+            f"their {'poses' if values[0] > 0 else 'images'} would explain the errors far better: "
+            f"import again with a --lag that is {abs(values[0]):.3f} s "
+            f"{'larger' if values[0] > 0 else 'smaller'}, or hold the probe still for each image"
+        ),
         "skew": lambda: (
             f"lateral positions that are too large by {100 * values[0]:.1f} % of the depth would "
             "explain the errors far better: a steered beam, or clicks beside the target?"

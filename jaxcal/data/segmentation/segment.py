@@ -232,6 +232,7 @@ def segment(
         max_elevation=images.max_elevation,
         amplitude=images.amplitude,
         time=images.time,
+        velocity=images.velocity,
         time_of_flight=times,
         frame=images.frame,
         minimum=0,
