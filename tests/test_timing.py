@@ -288,6 +288,15 @@ def test_a_lag_is_not_told_of_a_probe_at_rest_or_of_few_images() -> None:
     assert fitted_lag(t_image, one, t, still[of_image], max_gap_s=0.1) is None
 
 
+@pytest.mark.parametrize("lag", [-0.485, 0.48])
+def test_a_lag_near_the_end_of_the_search(lag: float) -> None:
+    """Every pose that is looked up for it is within the recording, to the last sample."""
+    t_image, t = 0.5 + 0.9 * np.arange(40), np.arange(0, 36.1 + 1e-9, 0.02)
+    found = fitted_lag(t_image, freehand(t_image - lag, 3)[1], t, freehand(t, 3)[0], max_gap_s=0.1)
+    assert found is not None
+    assert abs(found.lag_s - lag) < 4 * found.sd_s < 0.06
+
+
 def test_clocks_that_are_apart_by_more_than_is_searched() -> None:
     t_image, t = 2 + 0.9 * np.arange(40), np.arange(0, 40, 0.03)
     found = fitted_lag(t_image, freehand(t_image - 0.9, 2)[1], t, freehand(t, 2)[0], max_gap_s=0.1)

@@ -11,13 +11,14 @@ Numpy and scipy throughout: this runs once a recording, on hundreds of samples a
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from jaxcal import InputError
 from jaxcal.data.poses import check_poses
-from jaxcal.runtime.array_types import Bool, Float
+from jaxcal.runtime.array_types import Bool, Float, Int
 from jaxcal.runtime.given_values import real_array
 from jaxcal.runtime.messages import seconds
 
@@ -45,10 +46,10 @@ _FIT_IMAGES = 12, 200
 """Least and most images that are fitted at every lag."""
 
 
-def _increasing(t: np.ndarray, what: str, minimum: int = 2) -> Float[np.ndarray, " n"]:
+def _increasing(t: np.ndarray, what: str) -> Float[np.ndarray, " n"]:
     times = real_array(t, what)
-    if times.ndim != 1 or len(times) < minimum:
-        raise InputError(f"{what} must be a row of {minimum} times or more, not {times.shape}")
+    if times.ndim != 1 or len(times) < 2:
+        raise InputError(f"{what} must be a row of 2 times or more, not {times.shape}")
     if not np.isfinite(times).all():
         raise InputError(f"{what} {np.flatnonzero(~np.isfinite(times))[0]} is not a number")
     back = np.flatnonzero(np.diff(times) <= 0)
@@ -379,21 +380,9 @@ def fitted_lag(
     def squares_at(lags: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
         return np.sum(fitted_at(lags) ** 2, axis=(1, 2))
 
-    squares = squares_at(lags)
-    at_zero = squares[steps]
-    # Between two lags a fast motion may fit far better than at either.
-    bottoms = 1 + np.flatnonzero((squares[1:-1] <= squares[:-2]) & (squares[1:-1] < squares[2:]))
-    for bottom in bottoms:
-        near = _FIT_STEP_S * np.linspace(-1, 1, _FINE_STEPS)
-        closely = squares_at(lags[bottom] + near)
-        lowest = min(max(int(np.argmin(closely)), 2), _FINE_STEPS - 3)
-        part = slice(lowest - 2, lowest + 3)
-        bend, slope, level = np.polyfit(near[part] - near[lowest], closely[part], 2)
-        lags[bottom] += near[lowest]
-        squares[bottom] = closely[lowest]
-        if bend > 0 and abs(slope) < 2 * bend * _FIT_STEP_S:
-            lags[bottom] -= slope / (2 * bend)
-            squares[bottom] = level - slope**2 / (4 * bend)
+    coarse = squares_at(lags)
+    at_zero = coarse[steps]
+    lags, squares, bottoms = _refined(lags, coarse, squares_at)
     best = int(np.argmin(squares))
     # Most of the misfit is the target's distance from the image plane: one number an image. The
     # affine map, the target's place and the lag have 13 unknowns, for three coordinates an image.
@@ -405,7 +394,9 @@ def fitted_lag(
     sd = np.inf
     if best in bottoms:
         # As wide as a hand's motion allows: the tracker's noise would pass for motion.
-        behind, ahead = fitted_at(lags[best] + _FIT_STEP_S * np.array([-1, 1]))
+        largest = LARGEST_LAG_S - _FIT_STEP_S
+        middle = np.clip(lags[best], -largest, largest)
+        behind, ahead = fitted_at(middle + _FIT_STEP_S * np.array([-1, 1]))
         motion = np.sum((ahead - behind) ** 2)
         sd = float(2 * _FIT_STEP_S * np.sqrt(variance / motion)) if motion > 0 else np.inf
     misfit, given = np.sqrt([squares[best] / len(rows), at_zero / len(rows)])
@@ -419,6 +410,31 @@ def fitted_lag(
         float(evidence.max()),
         _rival(lags, evidence),
     )
+
+
+def _refined(
+    lags: Float[np.ndarray, " k"],
+    squares: Float[np.ndarray, " k"],
+    squares_at: Callable[[Float[np.ndarray, " j"]], Float[np.ndarray, " j"]],
+) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"], Int[np.ndarray, " b"]]:
+    """Lags and sums of squares with every local minimum at its place, and which these are.
+
+    Between two lags that are tried a fast motion may fit far better than at either.
+    """
+    lags, squares = lags.copy(), squares.copy()
+    bottoms = 1 + np.flatnonzero((squares[1:-1] <= squares[:-2]) & (squares[1:-1] < squares[2:]))
+    for bottom in bottoms:
+        near = _FIT_STEP_S * np.linspace(-1, 1, _FINE_STEPS)
+        closely = squares_at(lags[bottom] + near)
+        lowest = min(max(int(np.argmin(closely)), 2), _FINE_STEPS - 3)
+        part = slice(lowest - 2, lowest + 3)
+        bend, slope, level = np.polyfit(near[part] - near[lowest], closely[part], 2)
+        lags[bottom] += near[lowest]
+        squares[bottom] = closely[lowest]
+        if bend > 0 and abs(slope) < 2 * bend * 3 * (near[1] - near[0]):
+            lags[bottom] -= slope / (2 * bend)
+            squares[bottom] = level - slope**2 / (4 * bend)
+    return lags, squares, bottoms
 
 
 def _rival(lags: Float[np.ndarray, " k"], above: Float[np.ndarray, " k"]) -> float | None:
