@@ -291,6 +291,73 @@ claim(
     ),
 )
 
+# Images that lag behind their poses.
+APART = ("20", "40")
+
+
+def _lag(of: str, *lags: str, images: tuple[str, ...] = APART) -> tuple[float, float]:
+    return span(column("lag", of, images=images, lag_s=lags))
+
+
+claim(
+    ACCURACY,
+    "Without a lag, the import tells of one in at most {:.1f} % of the recordings, and the verdict "
+    "names one in at most {:.1f} %.",
+    lambda: percent(
+        max(column("lag", of, lag_s="0")) for of in ("told_at_import", "told_by_verdict")
+    ),
+)
+claim(
+    ACCURACY,
+    "a lag of 20 ms is named by the verdict in at least {:.1f} %, of 50 ms in at least {:.1f} %; "
+    "the import tells of 50 ms in at least {:.1f} %, of 100 ms in at least {:.1f} %.",
+    lambda: percent(
+        [
+            _lag("told_by_verdict", "0.02")[0],
+            _lag("told_by_verdict", "0.05")[0],
+            _lag("told_at_import", "0.05")[0],
+            _lag("told_at_import", "0.1")[0],
+        ]
+    ),
+)
+claim(
+    ACCURACY,
+    "The lags that the verdict names are {:.1f} to {:.1f} ms off (RMS), those of the import {:.1f} "
+    "to {:.1f} ms.",
+    lambda: [
+        1000 * error
+        for of in ("verdict_error_s", "import_error_s")
+        for error in _lag(of, "0.02", "0.05", "0.1", "0.2")
+    ],
+)
+claim(
+    ACCURACY,
+    "With a lag of 100 ms the verdict is good or fair in {:.1f} to {:.1f} %; with the lag of the "
+    "import stated, the median error falls from {:.2f} to {:.2f} mm to {:.2f} to {:.2f} mm, where "
+    "recordings without a lag have {:.2f} to {:.2f} mm.",
+    lambda: (
+        *percent(_lag("good_or_fair", "0.1")),
+        *_lag("error_mm", "0.1"),
+        *_lag("error_once_stated_mm", "0.1"),
+        *_lag("error_mm", "0"),
+    ),
+)
+claim(
+    ACCURACY,
+    "they count as few, {:.1f} to {:.1f} % are refused with lags of up to 100 ms, the others are "
+    "rarely good or fair ({:.1f} to {:.1f} %), and the verdict then seldom names the lag; the "
+    "import still does ({:.1f} to {:.1f} % of 50 ms and more). The verdict is good or fair "
+    "although the error exceeds the upper end of its 95 % interval in at most {:.1f} %.",
+    lambda: percent(
+        [
+            *_lag("refused", "0", "0.02", "0.05", "0.1", images=("100",)),
+            *_lag("good_or_fair", "0", "0.02", "0.05", "0.1", "0.2", images=("100",)),
+            *_lag("told_at_import", "0.05", "0.1", "0.2", images=("100",)),
+            max(column("lag", "good_and_wrong")),
+        ]
+    ),
+)
+
 # Bounded and uniform offsets.
 claim(
     ACCURACY,
