@@ -65,8 +65,8 @@ SETTINGS: dict[str, tuple[str, ...]] = {
         "with 4 to 20 poses",
         "250 clean recordings for each of three distributions and 30, 54 and 200 images",
         "1000 clean recordings each of 12, 30 and 60 images, and 200 each with one of ten faults",
-        "at about 40 mm/s, 30 poses a second; 300 recordings without a lag and 60 with each lag, of 20 "
-        "images, one a second, of 40, one every 0.9 s, and of 100, one every 0.2 s",
+        "at about 40 mm/s, 30 poses a second; 300 recordings without a lag and 60 with each lag, "
+        "of 20 images, one a second, of 40, one every 0.9 s, and of 100, one every 0.2 s",
         "With 20 and 40 images, a lag",
         "The 100 images cover 20 s of one movement",
         "ranges 4 % too long",
