@@ -338,8 +338,8 @@ def _found_points(sequence: TrackedSequence, results: FrameResults, minimum: int
         most = next(iter(results.reasons), "there are no frames")
         raise InputError(
             f"{sequence.source}: only {len(used)} of {len(used) + hidden} frames show a credible "
-            f"target, at least {minimum} are needed (most often: {most}); place the points "
-            "by hand: jaxcal pick"
+            f"target, at least {minimum} are needed (most often: {most}); "
+            "check --region and --target, or place the points by hand: jaxcal pick"
         )
     notes = []
     if blank:
