@@ -103,12 +103,17 @@ def initial_fit(problem: Problem, blocks: Blocks = RIGID) -> Parameters:
         blocks: the free unknowns.
 
     Raises:
-        InputError: something else than one problem.
+        InputError: something else than one problem, or pixels of an unknown size that is not free.
     """
     if not isinstance(problem, Problem) or problem.batch_shape:
         raise InputError(
             "initial_fit takes one problem: jaxcal.Problem.from_recording makes one, "
             "jax.vmap(initial_fit) takes a batch"
+        )
+    if problem.pixels and not problem.spacing_known and "scale" not in blocks:
+        raise InputError(
+            "the pixels have no spacing_mm: give it (jaxcal import --spacing), or free the scale: "
+            'blocks (*backend.RIGID, "scale")'
         )
     return _initial_fit(problem, blocks)
 

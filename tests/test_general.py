@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -203,8 +205,10 @@ def test_what_the_pieces_cannot_take_is_said_in_a_sentence():
     batch = jaxcal.stack([one, one])
     images = jax.jit(backend.ImagePlanes.of)(batch)
     somewhere = Parameters.of(jnp.eye(3), jnp.zeros(3), jnp.zeros(3))
+    pixels = replace(one, pixels=True, spacing_known=False)
     for call, said in (
         (lambda: backend.initial_fit(batch), "takes one problem"),
+        (lambda: backend.initial_fit(pixels), "the pixels have no spacing_mm"),
         (lambda: backend.ImagePlanes.of(one), "a batch with one leading axis"),
         *(
             (

@@ -351,7 +351,11 @@ def test_another_solver_is_refused_where_it_cannot_do_it():
         with pytest.raises(jaxcal.InputError, match="bounds"):
             jaxcal.calibrate(problem(1, images=12), options=other, **arguments)
     with pytest.raises(jaxcal.InputError, match="plain numbers"):
-        Options(solver=optx.LevenbergMarquardt(jnp.asarray(1e-8), 1e-8))
+        Options(solver=optx.LevenbergMarquardt(jnp.asarray([1e-8]), 1e-8))
+    # optimistix keeps its learning rate in an array, which has no hash.
+    given = [Options(solver=optx.GaussNewton(1e-8, 1e-8)) for _ in range(2)]
+    assert given[0] == given[1]
+    assert hash(given[0]) == hash(given[1])
 
 
 def test_without_derivatives_the_answer_is_a_constant():

@@ -171,7 +171,7 @@ def test_where_nothing_is_credible_the_way_on_is_named(tmp_path, capsys):
     write_sequence(path, {PAIR: POSES[:4]}, np.arange(4.0), images=frames)
     assert main(["segment", str(path)]) == 2
     assert "only 0 of 4 frames show a credible target" in (error := capsys.readouterr().err)
-    assert error.rstrip().endswith("place the points by hand: jaxcal pick")
+    assert "check --region and --target, or place the points by hand: jaxcal pick" in error
     assert [entry.name for entry in tmp_path.iterdir()] == ["n.igs.mha"]
 
 
@@ -191,6 +191,22 @@ def test_segment_refuses(tmp_path, monkeypatch, arguments, message, capsys):
     assert main(["segment", "f.igs.mha", *arguments]) == 2
     assert message in capsys.readouterr().err
     assert [entry.name for entry in tmp_path.iterdir()] == ["f.igs.mha"]
+
+
+def test_a_mark_of_the_machine_is_told_from_a_target(tmp_path, capsys):
+    """A logo that outshines the echo is found at the same place in every frame."""
+    path = tmp_path / "f.igs.mha"
+    frames = [FRAMES[0] if k < 6 else FRAMES[1] for k in range(COUNT)]
+    for poses, told in ((POSES, True), (np.tile(POSES[:1], (COUNT, 1, 1)), False)):
+        write_sequence(path, {PAIR: poses}, np.arange(COUNT) / 20, images=frames)
+        main(["import", str(path), str(tmp_path / "f.h5")])
+        said = " ".join(capsys.readouterr().out.split())
+        assert ("in 6 of 9 frames the target is at the same place" in said) == told
+
+
+def test_segment_of_a_folder_that_does_not_exist_blames_no_option(tmp_path, capsys):
+    assert main(["segment", str(tmp_path / "images"), "--poses", str(tmp_path / "p.csv")]) == 2
+    assert "images: no such file" in capsys.readouterr().err
 
 
 # Folders.

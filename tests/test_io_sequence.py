@@ -124,7 +124,7 @@ def test_unknown_orientation_is_asked_for(tmp_path, stated):
     written(tmp_path / "a.mha")
     edit(tmp_path / "a.mha", rb"Orientation = MFA", b"Orientation = " + stated)
     found = read_sequence(tmp_path / "a.mha")
-    with pytest.raises(FormatError, match="does not say how its pixels are oriented"):
+    with pytest.raises(FormatError, match="pixels are oriented: say it by --orientation"):
         next(found.images())
     assert next(found.images(orientation="UN")).shape == (6, 4)
 

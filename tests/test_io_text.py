@@ -91,6 +91,9 @@ def test_whole_matrices_are_poses_too(pair):
     pair[0].write_text("\n".join([*whole[:-1], "0 0 0 2"]))
     with pytest.raises(FormatError, match="8 poses but 6 points"):
         read_crosswire(*pair[:2])
+    np.savetxt(pair[0], pair[2].swapaxes(1, 2).reshape(-1, 4))
+    with pytest.raises(FormatError, match=r"poses\.txt:4: the matrices are transposed"):
+        read_crosswire(*pair[:2])
 
 
 def test_crosswire_rows_that_are_not_whole_poses(pair):

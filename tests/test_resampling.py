@@ -282,7 +282,7 @@ def test_beside_the_calibrations_nothing_is_compiled(data, whole):
         drawn = _placed(_with_rows(used, rows, np.ones((3, COUNT))), data)
         fits = map_arrays(lambda leaf: np.stack([leaf] * 3), replace(whole, problem=None))
         seen = _compared(used, whole, replace(fits, problem=None), np.arange(COUNT) % 3)
-        scatter = _scatter(used, whole, fits)
+        scatter = _scatter(used, whole, fits, np.ones(3, bool))
     finally:
         jax.monitoring.unregister_event_duration_listener(listen)
     assert compiled == []
@@ -300,6 +300,23 @@ def test_bootstrap_draws_used_images_only(data):
     np.testing.assert_allclose(one.image_to_probe, two.image_to_probe, atol=1e-9)
     with pytest.raises(jaxcal.InputError, match="resamples must be between"):
         bootstrap(data, 1)
+
+
+def test_bootstrap_counts_draws_that_determine_a_calibration(data, whole):
+    """Three different images are fitted perfectly, hundreds of mm from the truth."""
+    six = replace(data, mask=data.mask.at[6:].set(0.0))
+    found = bootstrap(six, COUNT, result=replace(whole, mask=six.mask), **CONVENTIONAL)
+    keys = jax.vmap(lambda k: jax.random.fold_in(jax.random.key(0), k))(np.arange(COUNT))
+    chosen = (6 * jax.vmap(lambda key: jax.random.uniform(key, (COUNT,)))(keys)[:, :6]).astype(int)
+    different = np.array([len(set(row)) for row in np.asarray(chosen).tolist()])
+    used = np.asarray(found.converged) > 0
+    assert 0 < np.sum(different < 4) < COUNT
+    np.testing.assert_array_equal(used, different >= 4)
+    expected = metrics.calibration_reproducibility(found.image_to_probe[used], found.image_points)
+    np.testing.assert_allclose(found.reproducibility, expected, rtol=1e-9)
+    four = replace(data, mask=data.mask.at[4:].set(0.0))
+    with pytest.raises(jaxcal.InputError, match="a bootstrap needs more than 4 images"):
+        bootstrap(four, COUNT, **CONVENTIONAL)
 
 
 @pytest.mark.slow

@@ -261,6 +261,9 @@ def test_ros_is_rigid_and_in_metres(tmp_path):
     (tmp_path / "cal.yaml").write_text(edited.replace("qw: 1.0", "qw: 1.0#"))
     with pytest.raises(FormatError, match=r"qw is not a number: '1\.0#'"):
         read_ros_yaml(tmp_path / "cal.yaml")
+    (tmp_path / "cal.yaml").write_text(edited.replace("  y: 0.0\n", "  y: -31.2\n"))
+    with pytest.raises(FormatError, match=r"31\.2 m from the probe's frame: .* look like mm"):
+        read_ros_yaml(tmp_path / "cal.yaml")
     # No pixels are needed, unlike everywhere else; the image may have had them.
     with pytest.raises(
         InputError, match=r"no pixel size is known, .* \(jaxcal export with --pixel"
@@ -597,6 +600,7 @@ def test_json_that_lies(tmp_path, change, message):
         (np.diag([0.1, np.nan, 0.1, 1]), "finite"),
         (np.diag([0.1, 0.1, 0.1, 2]), "last row"),
         (np.eye(4) + np.pad([[0.1]], ((0, 3), (1, 2))), "degrees apart: fCal fitted"),
+        (random_transform().image_plane_to_probe, "the matrix is rigid, as if a pixel measured"),
     ],
 )
 def test_matrices_that_are_no_calibration(matrix, message):

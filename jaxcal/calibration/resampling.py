@@ -30,7 +30,7 @@ from jaxcal.data.problem import Problem, as_problem
 from jaxcal.data.recording import MINIMUM_IMAGES, Images, Recording
 from jaxcal.diagnostics.image_errors import noise_covariance
 from jaxcal.diagnostics.intervals import range_of_row_zero
-from jaxcal.diagnostics.metrics import calibration_reproducibility, reconstruct
+from jaxcal.diagnostics.metrics import reconstruct
 from jaxcal.model.thresholds import MAD
 from jaxcal.model.unknowns import measured, split_further, unknown_names
 from jaxcal.result.calibration import Calibration
@@ -102,7 +102,8 @@ class Bootstrap(eqx.Module):
 
     Attributes:
         image_to_probe: (k, 4, 4) X of each resample.
-        converged: (k,) 1 where the resample's solve converged; the following use only those.
+        converged: (k,) 1 where the resample has at least four different images, as every
+            calibration needs, and its solve converged; the following use only those.
         spread: (6,) SD of X about the X of all images, [v, omega], mm and rad. It is computed from
             medians, so a few resamples with too few different images do not spoil it.
         reproducibility: (m,) mean distance of an image point from its mean over the resamples, mm,
@@ -226,8 +227,8 @@ def bootstrap(
         X of every resample and its scatter: a :class:`Bootstrap`.
 
     Raises:
-        InputError: fewer than 2 resamples, options that contradict each other, or a result by
-            another method than they ask for.
+        InputError: fewer than 2 resamples or 5 images, options that contradict each other, or a
+            result by another method than they ask for.
         CalibrationError: this process was forked from one in which JAX had started.
     """
     problem, plan, arguments = _one_problem(problem, arguments, "jaxcal.bootstrap")
@@ -240,19 +241,29 @@ def bootstrap(
     given, result = problem, _full_calibration(problem, result, plan, arguments)
     problem, xp = _used(problem, result)
     cumulative = xp.cumsum(problem.mask)
+    if xp is np and cumulative[-1] <= MINIMUM_IMAGES:
+        raise InputError(
+            f"a bootstrap needs more than {MINIMUM_IMAGES} images: with {int(cumulative[-1])} the "
+            "only draws that determine a calibration have all of them"
+        )
+    different = []
 
     def drawn(some: Int[np.ndarray, " k"]) -> Problem:
         uniform = _uniform(root, some, problem.images, problem.mask.dtype)
         # The first image at which the count of used images exceeds the draw is always a used one.
         chosen = xp.searchsorted(cumulative, xp.asarray(uniform) * cumulative[-1], side="right")
         rows = xp.minimum(chosen, problem.images - 1)
+        in_order = xp.sort(xp.where(problem.mask > 0, rows, -1), axis=1)
+        first = (in_order[:, 1:] != in_order[:, :-1]).sum(axis=1) + (in_order[:, 0] >= 0)
+        different.append(first)
         # Each draw has as many images as were used, since the mask leaves out the other rows.
         mask = xp.broadcast_to(problem.mask, rows.shape)
         return _placed(_with_rows(problem, rows, mask), given)
 
     fits = _in_batches(drawn, resamples, problem.images, arguments)
     scatter = _scatter if xp is np else jax.jit(_scatter)
-    return _placed(scatter(problem, result, fits), given)
+    enough = xp.concatenate(different) >= MINIMUM_IMAGES
+    return _placed(scatter(problem, result, fits, enough), given)
 
 
 @partial(jax.jit, static_argnums=(2, 3))
@@ -293,25 +304,40 @@ def _in_batches(
     return jax.tree.map(lambda *leaves: xp.concatenate(leaves), *parts)
 
 
-def _scatter(problem: Problem, result: Calibration, fits: Calibration) -> Bootstrap:
-    """How the calibrations of the resamples scatter about that of all images."""
+def _scatter(
+    problem: Problem, result: Calibration, fits: Calibration, enough: Bool[AnyArray, " k"]
+) -> Bootstrap:
+    """How the calibrations of the resamples scatter about that of all images.
+
+    Args:
+        problem: all images.
+        result: their calibration.
+        fits: those of the resamples.
+        enough: whether a resample has as many different images as a calibration needs. With fewer
+            it may fit perfectly far from the truth.
+    """
     problem, result, fits, xp = _plain(problem, result, fits)
-    converged = xp.asarray(fits.converged, problem.mask.dtype)
+    converged = xp.asarray(fits.converged & enough, problem.mask.dtype)
     whole, drawn = result.image_to_probe, fits.image_to_probe
     moved = xp.where(converged[:, None] > 0, xp.abs(relative_twist(whole, drawn)), xp.nan)
     # Where none converged, numpy would warn.
     unknown = xp is np and not converged.any()
     spread = moved[0] if unknown else xp.nanmedian(moved, axis=0)
     points = _box_points(problem, result)
-    # A resample that did not converge gets the X of all images, and adds nothing to the scatter.
+    # A resample that did not converge may hold NaN, which a weight of zero does not remove.
     found = _from_full_image(fits, result, problem)
     transforms = xp.where(converged[:, None, None] > 0, found, whole)
-    share = xp.maximum(xp.mean(converged), 1e-9)
+    zero, one = xp.zeros_like(points[:, 0]), xp.ones_like(points[:, 0])
+    there = xp.stack([points[:, 0], zero, points[:, 1], one])
+    seen = xp.swapaxes((transforms @ there)[:, :3], 1, 2)
+    weight = (converged / xp.maximum(xp.sum(converged), 1))[:, None]
+    mean = xp.sum(weight[..., None] * seen, axis=0)
+    distance = xp.sum(weight * xp.linalg.norm(seen - mean, axis=-1), axis=0)
     return Bootstrap(
         image_to_probe=drawn,
         converged=converged,
         spread=MAD * spread,
-        reproducibility=xp.asarray(calibration_reproducibility(transforms, points)) / share,
+        reproducibility=xp.where(xp.sum(converged) > 0, distance, xp.nan),
         image_points=points,
     )
 

@@ -99,8 +99,13 @@ def segment(
     plane; the size of the elevational offset by its times (without a sign) is written to the group
     segmentation.
     """
+    from jaxcal.io.given_files import check_readable, naming
+
     times = {name: frames.pop(name) for name in _TIMES}
     of_frames = _is_of_frames(recording)
+    if not of_frames:
+        # What does not exist is not known to be a sequence, and its options are not wrong.
+        check_readable(recording)
     others = times if of_frames else frames
     for parameter in context.command.params:
         given = context.get_parameter_source(parameter.name or "")
@@ -115,7 +120,6 @@ def segment(
     import_engine()
     from jaxcal.data.segmentation.segment import segment_recording
     from jaxcal.io.atomic import check_writable
-    from jaxcal.io.given_files import naming
     from jaxcal.io.hdf5 import load, save
     from jaxcal.io.outputs import RECORDING, check_output, is_recording
 

@@ -30,6 +30,10 @@ from jaxcal.io.two_tables import one_of_two_tables
 from jaxcal.runtime.array_types import Bool, Float, Int
 from jaxcal.runtime.messages import counted
 
+_AT_ONE_PLACE_PX = 0.5
+_MOVED_MM = 1.0
+"""A real target moves in the image by more than the first where a probe moves by the second."""
+
 
 class Imported(NamedTuple):
     """A recording and how it was made.
@@ -202,6 +206,7 @@ def _from_sequence(
                 else results.of_tracked(valid)
             )
             used = _found_points(sequence, results, options.minimum)
+            notes += _fixed_mark(used.points, poses[used.rows])
             given, what = len(sequence), "frames"
         else:
             where += f" with {os.fspath(points)}"
@@ -345,6 +350,19 @@ def _spacing(
     return stated.spacing_mm
 
 
+def _fixed_mark(points: Float[np.ndarray, "n 2"], poses: Float[np.ndarray, "n 4 4"]) -> list[str]:
+    """A note if most frames show the target at one place although the probe moved."""
+    middle = np.median(points, axis=0)
+    same = (np.abs(points - middle) < _AT_ONE_PLACE_PX).all(axis=1)
+    if 2 * same.sum() < len(points) or np.ptp(poses[same, :3, 3], axis=0).max() < _MOVED_MM:
+        return []
+    return [
+        f"in {same.sum()} of {len(points)} frames the target is at the same place, "
+        f"u = {middle[0]:.0f}, v = {middle[1]:.0f}, although the probe moved: is it a mark of the "
+        "machine? --region leaves it out"
+    ]
+
+
 def _found_points(sequence: TrackedSequence, results: FrameResults, minimum: int) -> FramePoints:
     """The target as it was found in the frames."""
     counts, used = results.counts, results.found
@@ -353,8 +371,8 @@ def _found_points(sequence: TrackedSequence, results: FrameResults, minimum: int
         most = next(iter(results.reasons), "there are no frames")
         raise InputError(
             f"{sequence.source}: only {len(used)} of {len(used) + hidden} frames show a credible "
-            f"target, at least {minimum} are needed (most often: {most}); place the points "
-            "by hand: jaxcal pick"
+            f"target, at least {minimum} are needed (most often: {most}); "
+            "check --region and --target, or place the points by hand: jaxcal pick"
         )
     notes = []
     if blank:

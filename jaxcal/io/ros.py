@@ -24,6 +24,8 @@ from jaxcal.runtime.messages import quoted
 
 _KEYS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_/]*")
+_FARTHEST_M = 2.0
+"""No image is farther from the probe's markers; in mm, only one within 2 mm would pass."""
 _HELD = "# jaxcal: "
 """How the comment begins that holds, as a JSON object, what a rigid transform leaves out."""
 
@@ -134,8 +136,8 @@ def read_ros_yaml(
         The transform, and the object in our comment, not checked; empty without the comment.
 
     Raises:
-        FormatError: one of the numbers missing, twice or not a number, no unit quaternion, or a
-            comment of ours that holds no JSON object.
+        FormatError: one of the numbers missing, twice or not a number, no unit quaternion, a
+            translation that is in mm, or a comment of ours that holds no JSON object.
     """
     name = os.fspath(path)
     found: dict[str, float] = {}
@@ -172,4 +174,10 @@ def read_ros_yaml(
     except InputError as error:
         raise FormatError(f"{name}: {error}") from None
     matrix[:3, 3] = [1e3 * found[key] for key in _KEYS[:3]]
+    far = float(np.linalg.norm(matrix[:3, 3])) / 1e3
+    if far > _FARTHEST_M:
+        raise FormatError(
+            f"{name}: puts the image {far:.4g} m from the probe's frame: x, y and z look like mm; "
+            "give them in metres"
+        )
     return matrix, held or {}

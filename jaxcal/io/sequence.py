@@ -257,8 +257,8 @@ class TrackedSequence:
             raise FormatError(f"{self.source}: holds {quoted(pixels.kind)} data, not B-mode images")
         if stored not in ("MF", "UF", "MN", "UN"):
             raise FormatError(
-                f"{self.source}: does not say how its pixels are oriented: name it (MF, UF, MN or "
-                "UN), as UltrasoundImageOrientation would"
+                f"{self.source}: does not say how its pixels are oriented: say it by --orientation "
+                "(MF, UF, MN or UN), as UltrasoundImageOrientation would"
             )
         size = pixels.frame_bytes
         with (

@@ -225,9 +225,16 @@ def read_crosswire(
         (4,),
         "3 rotation numbers and a translation, separated by white space; points come second",
     )
-    if len(rows) % 4 == 0 and (rows[3::4] == [0, 0, 0, 1]).all():
-        # Whole matrices: no row of a rotation is zero.
-        rows = rows.reshape(-1, 4, 4)[:, :3].reshape(-1, 4)
+    matrices = rows.reshape(-1, 4, 4) if len(rows) % 4 == 0 else np.empty((0, 4, 4))
+    edge = [0, 0, 0, 1]
+    # Whole matrices: no row of a rotation is zero.
+    if len(matrices) and (matrices[:, 3] == edge).all():
+        rows = matrices[:, :3].reshape(-1, 4)
+    elif len(matrices) and (matrices[:, :, 3] == edge).all():
+        raise FormatError(
+            f"{transforms.row(3)}: the matrices are transposed: 0 0 0 1 is their last column, and "
+            "should be their last row"
+        )
     if len(rows) % 3:
         raise FormatError(
             f"{transforms.row(-1)}: {len(rows)} rows are not whole poses: each takes 3 rows"

@@ -79,8 +79,15 @@ def resampled_sentences(record: dict[str, Any]) -> list[str]:
     if drawn is not None and drawn["reproducibility_mm"][-1] is not None:
         worst = max(value for value in drawn["reproducibility_mm"] if value is not None)
         turned = math.sqrt(sum((value or 0.0) ** 2 for value in drawn["rotation_sd_deg"]))
+        done, every = drawn["resamples_converged"], drawn["resamples"]
+        which = f"{done} bootstrap calibrations"
+        if done < every:
+            which = (
+                f"{done} of {every} bootstrap calibrations (the others had fewer than four "
+                "different images, or did not converge)"
+            )
         lines.append(
-            f"In {drawn['resamples']} bootstrap calibrations, a point in the middle of the image "
+            f"In {which}, a point in the middle of the image "
             f"scatters by {drawn['reproducibility_mm'][-1]:.2f} mm, the worst corner by "
             f"{worst:.2f} mm, and the orientation by {turned:.2f} degrees."
         )

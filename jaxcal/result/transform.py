@@ -42,6 +42,8 @@ _LARGEST = 1e9
 """Largest pixel; beyond it nothing is an image, and squares overflow."""
 _UNEQUAL = 1e-6
 """Largest difference between a covariance's two halves, as a share of the SDs' product."""
+_NO_SIZE = 1e-5
+"""How near 1 mm a pixel's sides are in a rigid matrix. Estimated sizes are not so near."""
 _SKEWED = 1e-3
 """Largest cosine between two columns of a matrix that count as orthogonal."""
 
@@ -446,8 +448,8 @@ def transform_from_plus_matrix(
 
     Raises:
         InputError: NaN, a last row other than 0 0 0 1, a reflection, pixels without a size or of
-            one that is not in mm, or columns that are not orthogonal to 1e-3, which a rigid
-            transform with a pixel size cannot have.
+            one that is not in mm, a rigid matrix, or columns that are not orthogonal to 1e-3, which
+            a rigid transform with a pixel size cannot have.
     """
     with naming(source):
         matrix = check_affine(matrix)
@@ -456,6 +458,12 @@ def transform_from_plus_matrix(
         raise InputError(f"{source}: a column of the matrix is zero: the pixels have no size")
     with naming(source):
         check_spacing_unit(scale)
+        if (np.abs(scale - 1) < _NO_SIZE).all():
+            raise InputError(
+                "the matrix is rigid, as if a pixel measured exactly 1 mm by 1 mm: one that takes "
+                "pixels to mm holds the size of a pixel in its columns. If it is jaxcal's "
+                "image_plane_to_probe, save the calibration itself (.json): its columns are others"
+            )
     lateral, axial = (matrix[:3, :2] / scale).T
     if abs(lateral @ axial) > _SKEWED:
         raise InputError(

@@ -79,7 +79,7 @@ class Options:
 
     def __post_init__(self) -> None:
         if is_optimistix(self.solver):
-            _check_static(self.solver)
+            object.__setattr__(self, "solver", _static(self.solver))
         elif not is_one_of(self.solver, SolverName):
             raise InputError(
                 "solver must be lm, gauss-newton, gradient or an optimistix least-squares solver, "
@@ -158,14 +158,25 @@ def is_optimistix(solver: Any) -> TypeGuard[optx.AbstractLeastSquaresSolver]:
     return found is not None and isinstance(solver, found.AbstractLeastSquaresSolver)
 
 
-def _check_static(solver: optx.AbstractLeastSquaresSolver) -> None:
-    """Check that a solver's settings are plain numbers, since a solver is part of the program."""
+def _static(solver: optx.AbstractLeastSquaresSolver) -> optx.AbstractLeastSquaresSolver:
+    """The solver with plain numbers as its settings, since a solver is part of the program.
+
+    optimistix makes an array of some, such as the learning rate of its Gauss-Newton solver.
+    """
+    import jax
+
+    def plain(leaf: Any) -> Any:
+        scalar = isinstance(leaf, jax.Array | np.ndarray) and leaf.ndim == 0
+        return leaf.item() if scalar and not is_traced(leaf) else leaf
+
+    solver = jax.tree.map(plain, solver)
     try:
         hash(solver)
     except TypeError:
         raise InputError(
             f"the settings of {type(solver).__name__} must be plain numbers, not arrays"
         ) from None
+    return solver
 
 
 def check_size(name: str, value: Any, least: float, *, one: bool = True, unit: str = "mm") -> None:

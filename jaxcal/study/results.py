@@ -94,7 +94,7 @@ def read_all(store: Store[Spec], *, incomplete: bool = False) -> dict[str, np.nd
     for index in present:
         chunk = spec.chunk(index)
         part = slice(chunk.start, chunk.stop)
-        for name, array in store.read(chunk).items():
+        for name, array in store.read_done(chunk).items():
             of_condition = values[name][chunk.condition]
             of_condition[part if name == "realised" else (slice(None), part)] = array
     return values

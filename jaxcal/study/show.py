@@ -90,7 +90,7 @@ def summarise(store: Store[Spec]) -> list[Cell]:
     cells = []
     for number, indices in sorted(by_condition.items()):
         condition = spec.condition(number)
-        parts = [store.read(spec.chunk(index)) for index in indices]
+        parts = [store.read_done(spec.chunk(index)) for index in indices]
         got = {
             name: np.concatenate([part[name] for part in parts], axis=1)
             for name in ("rp", "status", "iterations", "rotation_error", "translation_error")

@@ -183,6 +183,15 @@ class Store(Generic[S]):
                 raise FormatError("is damaged: its checksum is wrong")
             return results
 
+    def read_done(self, chunk: Chunk) -> dict[str, np.ndarray]:
+        """As :meth:`read`, of a chunk that is taken for done; the error says what helps."""
+        try:
+            return self.read(chunk)
+        except FormatError as error:
+            raise FormatError(
+                f"{error}; 'jaxcal study run ... --resume' computes it again"
+            ) from error
+
     def versions(self, chunk: Chunk) -> str:
         """What computed a chunk: versions and device, in words."""
         with open_root(self.path(chunk)) as root:
