@@ -395,6 +395,20 @@ def test_poses_of_other_times_are_told_and_cost_no_images(frames, by, words):
     assert words in (frame_checks.wrong_frames(joined) or "")
 
 
+def test_errors_alike_in_a_few_images_cost_none_where_they_widen_the_covariance(frames):
+    """One image in five or ten was kept, with up to three times the error, or too few were left."""
+    made = frames.along(100, 0.7, np.random.default_rng([77, 2]))
+    data = jaxcal.Problem.from_arrays(made.poses, made.points)
+    assert independent(data, widened=True)[0] is data
+    result = jaxcal.calibrate(data, "conventional")
+    assert result.images_used == 100
+    assert not result.notes
+    # A bound on the offsets leaves no covariance to be widened.
+    bounded = jaxcal.calibrate(data, "alternating", max_elevation=3.0)
+    assert 4 <= bounded.images_used < 30
+    assert "stay alike" in bounded.notes[0]
+
+
 def test_negligible_errors_cost_no_images_however_slowly_they_change():
     """A planned target in the plane leaves offsets of hundredths of a mm: the fit's own error."""
     rng = np.random.default_rng(3)

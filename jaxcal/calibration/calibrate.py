@@ -18,7 +18,7 @@ import numpy as np
 from jaxcal import InputError
 from jaxcal.calibration.conventional import closed_form_answer
 from jaxcal.calibration.dependence import independent
-from jaxcal.calibration.serial_correlation import widened
+from jaxcal.calibration.serial_correlation import widened, widens
 from jaxcal.data.problem import Problem, as_batch, as_problem, check_shapes, check_values
 from jaxcal.data.recording import MINIMUM_IMAGES, Images, Recording
 from jaxcal.model.unknowns import (
@@ -199,7 +199,8 @@ def _calibrated(problem: Problem, request: Request) -> Calibration:
     # Under jit the answer is traced even if the problem is not.
     if inside_transformation(problem, given):
         return replace(_solve_alone(problem, given, plan), problem=problem)
-    joined, found = independent(problem, request.estimate)
+    widening = widens(plan.channels, plan.prior)
+    joined, found = independent(problem, request.estimate, widened=widening)
     if found.images < MINIMUM_IMAGES:
         raise InputError(
             f"{'; '.join(found.words) or 'too few images'}; at least {MINIMUM_IMAGES} that are "

@@ -22,8 +22,9 @@ out.
 *Streams.* Images of a moving probe may differ in pose and still share slowly changing errors. The
 residuals of the conventional fit (closed form, :mod:`jaxcal.solvers.closed_form.single`) have an
 integrated autocorrelation time t, and n images are worth n / t independent ones. Where t reaches
-``LEAST_STREAM_TIME`` images and chance does not explain it, every t-th image is kept. For weaker
-correlation see :mod:`jaxcal.calibration.serial_correlation`.
+``LONG_STREAM_TIME`` images and chance does not explain it, every t-th image is kept. Weaker
+correlation widens the covariance (:mod:`jaxcal.calibration.serial_correlation`); where it cannot,
+every t-th image is kept from ``LEAST_STREAM_TIME`` on.
 
 References: Wiles, Thompson and Frantz 2004 (accuracy of optical trackers); Sokal 1997,
 section 3 (integrated autocorrelation time); Liang and Zeger 1986 (clustered data).
@@ -65,7 +66,10 @@ LEAST_MOVED = 3.0
 """px for pixels, mm for points: what noise of the points can do where they hardly differ."""
 
 LEAST_STREAM_TIME = 4.0
-"""Least autocorrelation time of a stream, in images."""
+"""Least autocorrelation time of a stream, in images, where the covariance is not widened."""
+LONG_STREAM_TIME = 10.0
+"""The same where it is. Up to it, the widened intervals of all images hold as often as those of the
+few that would be left, and the errors are smaller: by a third to two thirds in simulated paths."""
 STREAM_SCORE = 5.0
 """In a stream the correlation of successive errors is more than so many SDs above zero."""
 
@@ -137,7 +141,7 @@ class IndependentImages:
 
 
 def independent(
-    problem: Problem, estimate: tuple[str, ...] = ()
+    problem: Problem, estimate: tuple[str, ...] = (), *, widened: bool = False
 ) -> tuple[Problem, IndependentImages]:
     """Let every pose count once.
 
@@ -145,6 +149,8 @@ def independent(
         problem: one problem with concrete values.
         estimate: what the calibration will estimate; the fit in this module estimates the pixel
             size or the sound speed where it does, and a pixel size that is not known.
+        widened: whether errors that are alike in successive images will widen the covariance
+            (:func:`jaxcal.calibration.serial_correlation.widens`).
 
     Returns:
         The problem, and which images are independent. The problem has the same shape: one image of
@@ -171,7 +177,7 @@ def independent(
     if found.poses < found.frames:
         problem = _with_group_averages(problem, found)
     if found.images >= SHORTEST_STREAM:
-        stride = _stride(problem, estimate)
+        stride = _stride(problem, estimate, LONG_STREAM_TIME if widened else LEAST_STREAM_TIME)
         if stride > 1:
             left = np.flatnonzero(found.keep)
             keep = np.zeros_like(found.keep)
@@ -388,7 +394,7 @@ def _with_arrays(data: Any, values: dict[str, np.ndarray]) -> Any:
     return replace(data, **changed)
 
 
-def _stride(problem: Problem, estimate: tuple[str, ...]) -> int:
+def _stride(problem: Problem, estimate: tuple[str, ...], least: float) -> int:
     """The number t for which every t-th image of a stream is kept; 1 for other recordings."""
     if not _moves_continuously(np.asarray(problem.poses, float)[np.asarray(problem.mask) > 0]):
         # Errors that are alike for long are then no stream's: a mount has slipped, say.
@@ -397,7 +403,7 @@ def _stride(problem: Problem, estimate: tuple[str, ...]) -> int:
     if errors is None:
         return 1
     time = alike_for(errors)
-    if time < LEAST_STREAM_TIME or wrong_frames(problem, estimate):
+    if time < least or wrong_frames(problem, estimate):
         # Errors of wrong poses are alike for as long as the motion lasts, but no image has them:
         # of the few that were kept, a fit would show nothing.
         return 1

@@ -26,6 +26,7 @@ from jaxcal import InputError
 from jaxcal.calibration.calibrate import Request, calibrate, calibrate_batch, prepare
 from jaxcal.calibration.dependence import independent
 from jaxcal.calibration.engine import as_jax_holds
+from jaxcal.calibration.serial_correlation import widens
 from jaxcal.data.problem import Problem, as_problem
 from jaxcal.data.recording import MINIMUM_IMAGES, Images, Recording
 from jaxcal.diagnostics.image_errors import noise_covariance
@@ -446,7 +447,8 @@ def _one_problem(
     arguments = {name: value for name, value in arguments.items() if name != "max_elevation"}
     if any(is_traced(leaf) for leaf in jax.tree.leaves(problem)):
         return problem, plan, arguments
-    return as_jax_holds(independent(problem, estimate)[0], problem), plan, arguments
+    joined = independent(problem, estimate, widened=widens(plan.channels, plan.prior))[0]
+    return as_jax_holds(joined, problem), plan, arguments
 
 
 def _plain(*trees: Any) -> tuple[Any, ...]:

@@ -64,6 +64,11 @@ ROUNDS, STEPS = 3, 3
 """Rounds over the kinds of error, and steps to the variance in each."""
 
 
+def widens(channels: bool, prior: str) -> bool:
+    """Whether :func:`widened` changes anything: not from channels or with bounded offsets."""
+    return not channels and prior != "bounded"
+
+
 def widened(result: Calibration) -> Calibration:
     """The calibration with its covariance widened for errors that are alike in successive images.
 
@@ -74,7 +79,7 @@ def widened(result: Calibration) -> Calibration:
         Calibrations from channels, with bounded offsets or with fewer than ``FEWEST_SUCCESSIVE``
         images are returned unchanged.
     """
-    if result.data != "points" or result.prior == "bounded" or result.problem is None:
+    if not widens(result.data == "channels", result.prior) or result.problem is None:
         return result
     covariance = np.asarray(result.unknowns_covariance)
     # Counted by numpy, since JAX would compile the count anew for every number of images.
