@@ -31,7 +31,7 @@ from jaxcal.data.problem import Problem, as_problem
 from jaxcal.data.recording import MINIMUM_IMAGES, Images, Recording
 from jaxcal.diagnostics.image_errors import noise_covariance
 from jaxcal.diagnostics.intervals import range_of_row_zero
-from jaxcal.diagnostics.metrics import reconstruct
+from jaxcal.diagnostics.metrics import distance_from_mean, reconstruct
 from jaxcal.model.thresholds import MAD
 from jaxcal.model.unknowns import measured, split_further, unknown_names
 from jaxcal.result.calibration import Calibration
@@ -328,17 +328,11 @@ def _scatter(
     # A resample that did not converge may hold NaN, which a weight of zero does not remove.
     found = _from_full_image(fits, result, problem)
     transforms = xp.where(converged[:, None, None] > 0, found, whole)
-    zero, one = xp.zeros_like(points[:, 0]), xp.ones_like(points[:, 0])
-    there = xp.stack([points[:, 0], zero, points[:, 1], one])
-    seen = xp.swapaxes((transforms @ there)[:, :3], 1, 2)
-    weight = (converged / xp.maximum(xp.sum(converged), 1))[:, None]
-    mean = xp.sum(weight[..., None] * seen, axis=0)
-    distance = xp.sum(weight * xp.linalg.norm(seen - mean, axis=-1), axis=0)
     return Bootstrap(
         image_to_probe=drawn,
         converged=converged,
         spread=MAD * spread,
-        reproducibility=xp.where(xp.sum(converged) > 0, distance, xp.nan),
+        reproducibility=distance_from_mean(transforms, points, converged),
         image_points=points,
     )
 

@@ -112,7 +112,20 @@ def calibration_reproducibility(
         )
     if image_points.ndim != 2 or image_points.shape[1] != 2:
         raise InputError(f"image_points must have shape (m, 2), not {image_points.shape}")
+    return distance_from_mean(transforms, image_points, xp.ones_like(transforms[:, 0, 0]))
+
+
+def distance_from_mean(
+    transforms: Float[AnyArray, "k 4 4"],
+    image_points: Float[AnyArray, "m 2"],
+    weight: Float[AnyArray, " k"],
+) -> Float[AnyArray, " m"]:
+    """The same by weighted means; NaN where all weights are zero."""
+    xp = array_module(transforms, image_points, weight)
     zero = xp.zeros_like(image_points[:, 0])
     points = xp.stack([image_points[:, 0], zero, image_points[:, 1]], axis=1)
     images = _transformed(transforms[:, None], points[None])
-    return xp.mean(xp.linalg.norm(images - xp.mean(images, axis=0), axis=-1), axis=0)
+    total = xp.sum(weight)
+    share = (weight / xp.where(total > 0, total, xp.nan))[:, None]
+    mean = xp.sum(share[..., None] * images, axis=0)
+    return xp.sum(share * xp.linalg.norm(images - mean, axis=-1), axis=0)
