@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 import tracemalloc
@@ -393,6 +394,18 @@ def test_poses_of_other_times_are_told_and_cost_no_images(frames, by, words):
     joined, found = independent(jaxcal.Problem.from_arrays(poses[:-by], points[by:]))
     assert found.images == len(points) - by > 1.4 * frame_checks.MOST_IMAGES
     assert words in (frame_checks.wrong_frames(joined) or "")
+
+
+def test_a_long_stream_keeps_sixty_images_where_errors_widen_the_covariance(frames):
+    """Only as many were kept as are independent: about fifteen."""
+    made = frames.swept(30, 1.0, np.random.default_rng(5))
+    _, found = independent(jaxcal.Problem.from_arrays(made.poses, made.points), widened=True)
+    assert 60 <= found.images < 2 * 60
+    assert 20 < found.alike < found.poses / 4
+    (told,) = found.words
+    alike = int(re.search(r"stay alike for about (\d+) frames", told)[1])
+    assert alike == round(found.alike * found.frames / found.poses)
+    assert f"{found.images} of them are used" in told
 
 
 def test_errors_alike_in_a_few_images_cost_none_where_they_widen_the_covariance(frames):

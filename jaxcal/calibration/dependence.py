@@ -22,9 +22,10 @@ out.
 *Streams.* Images of a moving probe may differ in pose and still share slowly changing errors. The
 residuals of the conventional fit (closed form, :mod:`jaxcal.solvers.closed_form.single`) have an
 integrated autocorrelation time t, and n images are worth n / t independent ones. Where t reaches
-``LONG_STREAM_TIME`` images and chance does not explain it, every t-th image is kept. Weaker
-correlation widens the covariance (:mod:`jaxcal.calibration.serial_correlation`); where it cannot,
-every t-th image is kept from ``LEAST_STREAM_TIME`` on.
+``LEAST_STREAM_TIME`` images and chance does not explain it, images are left out at equal intervals.
+``KEPT_OF_TIME`` of a time t are kept, and ``KEPT_OF_STREAM`` of a whole stream, since the
+correlation that remains widens the covariance (:mod:`jaxcal.calibration.serial_correlation`), and
+does so better the more images show it. Where it cannot, one of a time t is kept.
 
 References: Wiles, Thompson and Frantz 2004 (accuracy of optical trackers); Sokal 1997,
 section 3 (integrated autocorrelation time); Liang and Zeger 1986 (clustered data).
@@ -66,10 +67,12 @@ LEAST_MOVED = 3.0
 """px for pixels, mm for points: what noise of the points can do where they hardly differ."""
 
 LEAST_STREAM_TIME = 4.0
-"""Least autocorrelation time of a stream, in images, where the covariance is not widened."""
-LONG_STREAM_TIME = 10.0
-"""The same where it is. Up to it, the widened intervals of all images hold as often as those of the
-few that would be left, and the errors are smaller: by a third to two thirds in simulated paths."""
+"""Least autocorrelation time of a stream, in images."""
+
+KEPT_OF_TIME, KEPT_OF_STREAM = 2.5, 60
+"""With fewer images the errors of simulated streams are up to three times larger, and intervals do
+not hold more often; with ten in a correlation time, and hundreds in a stream, intervals are too
+short."""
 STREAM_SCORE = 5.0
 """In a stream the correlation of successive errors is more than so many SDs above zero."""
 
@@ -99,6 +102,7 @@ class IndependentImages:
         frames: number of used images.
         poses: number of different poses among them.
         stride: one of so many poses of a stream is kept; 1 where the recording is no stream.
+        alike: for how many poses the errors of a stream stay alike; 1 for other recordings.
         frozen: images left out, since their pose is repeated while the target moves.
     """
 
@@ -107,6 +111,7 @@ class IndependentImages:
     frames: int
     poses: int
     stride: int = 1
+    alike: float = 1.0
     frozen: tuple[int, ...] = ()
 
     @property
@@ -126,11 +131,11 @@ class IndependentImages:
                 f"{named}"
             )
         if self.stride > 1:
-            worth = self.frames / self.images
+            alike = self.alike * self.frames / self.poses
             told.append(
                 f"{self.frames} frames of a moving probe, whose errors stay alike for about "
-                f"{worth:.0f} frames (a lag between images and poses, a slipped mount, or another "
-                f"depth setting?): they count as {self.images} image{'s' * (self.images != 1)}"
+                f"{alike:.0f} frames (a lag between images and poses, a slipped mount, or another "
+                f"depth setting?): {self.images} of them {'is' if self.images == 1 else 'are'} used"
             )
         elif self.images < self.frames:
             told.append(
@@ -177,13 +182,16 @@ def independent(
     if found.poses < found.frames:
         problem = _with_group_averages(problem, found)
     if found.images >= SHORTEST_STREAM:
-        stride = _stride(problem, estimate, LONG_STREAM_TIME if widened else LEAST_STREAM_TIME)
+        alike = _alike_for(problem, estimate)
+        stride = int(alike)
+        if widened:
+            stride = max(int(min(alike / KEPT_OF_TIME, found.images / KEPT_OF_STREAM)), 1)
         if stride > 1:
             left = np.flatnonzero(found.keep)
             keep = np.zeros_like(found.keep)
             # Keep the middle of every piece.
             keep[left[stride // 2 :: stride]] = True
-            found = replace(found, keep=keep, stride=stride)
+            found = replace(found, keep=keep, stride=stride, alike=alike)
             problem = _with_arrays(problem, {"mask": keep})
     return problem, found
 
@@ -394,20 +402,20 @@ def _with_arrays(data: Any, values: dict[str, np.ndarray]) -> Any:
     return replace(data, **changed)
 
 
-def _stride(problem: Problem, estimate: tuple[str, ...], least: float) -> int:
-    """The number t for which every t-th image of a stream is kept; 1 for other recordings."""
+def _alike_for(problem: Problem, estimate: tuple[str, ...]) -> float:
+    """For how many images of a stream the errors stay alike; 1 for other recordings."""
     if not _moves_continuously(np.asarray(problem.poses, float)[np.asarray(problem.mask) > 0]):
         # Errors that are alike for long are then no stream's: a mount has slipped, say.
-        return 1
+        return 1.0
     errors = _conventional_errors(problem, estimate)
     if errors is None:
-        return 1
+        return 1.0
     time = alike_for(errors)
-    if time < least or wrong_frames(problem, estimate):
+    if time < LEAST_STREAM_TIME or wrong_frames(problem, estimate):
         # Errors of wrong poses are alike for as long as the motion lasts, but no image has them:
         # of the few that were kept, a fit would show nothing.
-        return 1
-    return int(time)
+        return 1.0
+    return time
 
 
 def _moves_continuously(poses: Float[np.ndarray, "n 4 4"]) -> bool:
