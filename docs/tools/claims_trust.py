@@ -215,8 +215,8 @@ def _good() -> list[float]:
 claim(ACCURACY, "and in {:.1f} to {:.1f} % of the sweeps.", _good)
 claim(
     ACCURACY,
-    "In these the error of X's translation is {:.2f} to {:.2f} mm (RMS), and {:.2f} to {:.2f} mm if "
-    "every frame counted.",
+    "In these the error of X's translation is {:.2f} to {:.2f} mm (RMS), and {:.2f} to {:.2f} mm "
+    "if every frame counted.",
     lambda: [
         *span(_frames("error_mm", "calibrate", SWEEPS)),
         *span(_frames("error_mm", "every frame", SWEEPS)),
