@@ -558,6 +558,7 @@ def contradicted(kind, record):
     else:
         changed["bootstrap"] = {
             "reproducibility_mm": [2.3] * 5, "stated_mm": 0.4, "resamples": 200,
+            "resamples_converged": 190,
             "rotation_sd_deg": [0.1] * 3,
         }  # fmt: skip
     return changed
