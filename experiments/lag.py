@@ -8,12 +8,10 @@ the stamps of the images, as ``jaxcal import --poses`` does.
 
 For each: in which share a lag is told of at the import (:func:`jaxcal.data.timing.fitted_lag`) and
 by the verdict of the calibration with the default prior, the root mean square errors of both
-estimates where they are told, in which share a recording is refused (so few of its images are
-independent) or another fault is told of, in which the verdict is good or fair, in which it is so
+estimates where they are told, in which share a recording is refused (fewer than four poses differ)
+or another fault is told of, in which the verdict is good or fair, in which it is so
 although the actual error exceeds the end of its 95 % interval, and the median of the actual error.
 The last columns are of calibrations in which the lag of the import was stated.
-
-Where the errors are alike in images 0.2 s apart, other slow errors are told of as well.
 
 Seed 20261128; trial k of a condition is the k-th child of (seed, condition).
 """
@@ -162,7 +160,6 @@ def calibrated(
         try:
             result = jaxcal.calibrate(recording)
         except jaxcal.InputError:
-            # Successive errors are so much alike that fewer than four images are independent.
             lags.append(None)
             rows.append([1.0, 0.0, 0.0, 0.0, np.nan])
             continue

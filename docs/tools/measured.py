@@ -67,8 +67,9 @@ SETTINGS: dict[str, tuple[str, ...]] = {
         "1000 clean recordings each of 12, 30 and 60 images, and 200 each with one of ten faults",
         "at about 40 mm/s, 30 poses a second; 300 recordings without a lag and 60 with each lag, "
         "of 20 images, one a second, of 40, one every 0.9 s, and of 100, one every 0.2 s",
-        "With 20 and 40 images, a lag",
-        "The 100 images cover 20 s of one movement",
+        "A lag of 20 ms is named",
+        "of 50 or 100 ms in at least",
+        "(200 ms, of the 100 images)",
         "ranges 4 % too long",
         "lateral positions 4 % too long",
         "200 recordings each of 12, 30 and 60 images, with uniform offsets up to 1 mm or normal "
