@@ -1045,6 +1045,12 @@ def test_images_are_added_to_a_recording(tmp_path, capsys):
     moving = np.isfinite(jaxcal.load(out).calibration.velocity).all(axis=1)
     assert moving.tolist() == [True] * 4 + [False] * 2
 
+    # A single image, with the time of its pose.
+    row = [np.array([9.0]), PIXELS[3:4] + 1, TRANSLATIONS[3:4] + 5, QUATERNIONS[3:4]]
+    (tmp_path / "one.csv").write_text("\n".join(table(["time", *NAMES], row)))
+    assert main(["import", str(tmp_path / "one.csv"), out, "--add-to", first]) == 0
+    assert len(jaxcal.load(out)) == 5
+
     def refused(*arguments: str) -> str:
         assert main(["import", *arguments]) == 2
         return capsys.readouterr().err

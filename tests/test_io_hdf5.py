@@ -480,7 +480,7 @@ def with_nan(values):
         ("mask", lambda _: np.ones(COUNT - 1, bool), r"mask must have shape \(6,\)"),
         ("time", lambda _: np.full(COUNT, np.inf), "time 0 is NaN or Inf"),
         ("max_elevation", lambda _: -np.ones(COUNT), "max_elevation 0 is negative"),
-        ("velocity", lambda _: np.full((COUNT, 6), np.inf), "velocity 0 holds Inf"),
+        ("velocity", lambda _: np.full((COUNT, 6), np.inf), "velocity 0 holds a number beyond"),
         ("amplitude", lambda _: np.ones(COUNT + 1), r"amplitude must have shape \(6,\)"),
         ("covariance", lambda _: np.zeros((COUNT, 2, 2)), "covariance 0 is not symmetric"),
     ],

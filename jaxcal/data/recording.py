@@ -615,7 +615,8 @@ def _velocity(values: np.ndarray | None, count: int) -> Float[np.ndarray, "n 6"]
     if values is None:
         return None
     values = _shaped(values, "velocity", (count, 6))
-    _refuse("velocity", np.isinf(values).any(axis=1), "holds Inf")
+    beyond = (np.abs(values) > LARGEST).any(axis=1)
+    _refuse("velocity", beyond, f"holds a number beyond {LARGEST:g}: that cannot be a measure")
     return values
 
 

@@ -122,12 +122,18 @@ def _from_table(table: PoseTable, notes: list[str], lost: int, options: ImportOp
     if table.time is not None:
         time, said = _good_time(table.time, lambda row: f"{table.name}:{table.lines[row]}", options)
         table, notes = replace(table, time=time), notes + said
-        if time is not None and table.poses is not None and table.velocity is None:
-            track = PoseTrack.of_table(time, table.poses, table.name)
-            table = replace(table, velocity=track.velocities(time))
+        if time is not None and table.velocity is None:
+            table = replace(table, velocity=_velocities(time, table))
     with _naming_pose_units(options, table.length_stated):
         recording = recording_of(table, options.spacing_mm, options.minimum)
     return Imported(recording, notes, most_lost=len(table) < lost)
+
+
+def _velocities(time: Float[np.ndarray, " n"], table: PoseTable) -> Float[np.ndarray, "n 6"] | None:
+    """How the probe moved, from the poses of neighbouring rows; None where they do not tell."""
+    if table.poses is None or len(time) < 2:
+        return None
+    return PoseTrack.of_table(time, table.poses, table.name).velocities(time)
 
 
 @contextmanager

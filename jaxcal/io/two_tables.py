@@ -93,13 +93,14 @@ def _poses_of(
             {}, {}, points.time, everywhere, source=points.name, clock=points.clock
         )
         tracking = tracking_of_table(poses, images)
-        track = PoseTrack.of(tracking)
+        track, estimated = PoseTrack.of(tracking), lag_s == "auto"
+        notes: list[str] = []
         if lag_s == "auto":
             lag_s, told = lag_of_points(points.time, points.points, track)
             notes = [told]
-        else:
-            notes = better_lag(points.time, points.points, track, lag_s)
         images, said = with_poses_by_time(images, tracking, lag_s)
+        if not estimated:
+            notes = better_lag(points.time, points.points, track, lag_s)
         (found,), (valid,) = images.transforms.values(), images.valid.values()
         return found, valid, track.velocities(points.time - lag_s), said + notes
     _refuse_lag(lag_s)
