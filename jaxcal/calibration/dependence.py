@@ -94,7 +94,7 @@ LEAST_SHARE_LEFT = 0.4
 
 @dataclass(frozen=True)
 class IndependentImages:
-    """Which images can be treated as independent.
+    """Which images of a recording are used, and why others are not.
 
     Attributes:
         group: (n,) number of each image's pose; -1 where it is not used.
@@ -158,9 +158,9 @@ def independent(
             (:func:`jaxcal.calibration.serial_correlation.widens`).
 
     Returns:
-        The problem, and which images are independent. The problem has the same shape: one image of
-        every group has the group's mean pose and point, and the others are masked out. Where all
-        images are independent, it is the same object.
+        The problem, and which images are used. The problem has the same shape: one image of every
+        group has the group's mean pose and point, and the others are masked out. Where all images
+        are used, it is the same object.
 
     Raises:
         InputError: fewer than 4 different poses.
