@@ -361,9 +361,9 @@ def figure(trials: list[Trial]):
             axes[0, column].plot(when, [1000 * t.rest_s for t in mine], ".", label=way)
             axes[1, column].plot(when, [t.travel_mm for t in mine], ".", label=way)
         axes[0, column].axhline(1000 * REST_WITHIN_S, color="k", linestyle="--")
-        axes[1, column].axhline(TRAVEL_WITHIN_MM, color="k", linestyle="--", label="bar")
+        axes[1, column].axhline(TRAVEL_WITHIN_MM, color="k", linestyle="--", label="limit")
         hz = 500 if SERIES[series][0] >= 5 else 125
-        axes[0, column].set(title=f"{series} controller, {hz} Hz")
+        axes[0, column].set(title=f"{series}-Series controller, {hz} Hz")
         axes[1, column].set(xlabel="stop, ms after the request to move")
     axes[0, 0].set(ylabel="time to rest (ms)")
     axes[1, 0].set(ylabel="travel after the stop (mm)")

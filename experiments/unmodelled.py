@@ -1,7 +1,7 @@
 """Errors that the model leaves out: how often are they told of, and what becomes of the verdict?
 
 Simulated recordings (uniform offsets of SD 1 mm, noise level 1) without any fault and with one of
-ten, calibrated with the default prior:
+twelve, calibrated with the default prior:
 
 - ``scale``: ranges 4 % too long (a sound speed of 1540 m/s in water of 1480 m/s);
 - ``skew``: lateral positions off by 3 % of the depth;
@@ -15,7 +15,10 @@ ten, calibrated with the default prior:
   positions as these are (root mean square), anywhere, and points anywhere;
 - ``targets``: a third of the images, any of them, show a second target, 12 mm from the first;
 - ``lateral``: lateral positions 4 % too long. The sound speed is estimated, as in ``none, sound
-  speed estimated``, which has no fault.
+  speed estimated``, which has no fault;
+- ``marker``: from one side, in half of the orientations, the tracker sees the probe's markers
+  turned by 1.2 degrees and moved by 1 mm (a sphere that is hidden or in a wrong place);
+- ``displaced``: the target moves by 2 mm, in any direction, before the last quarter of the images.
 
 For each: the share in which something is told of (a kind of error that the model leaves out, or
 two groups), in which it is the right thing, in which two targets are told of, in which the verdict
@@ -37,6 +40,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from common import arguments, machine, write_table
+from jax.scipy.spatial.transform import Rotation
 from jaxtyping import Array
 
 import jaxcal
@@ -49,13 +53,18 @@ from jaxcal.runtime.jax_cache import enable_compilation_cache
 SEED = 20261123
 FAULTS = (
     "none", "scale", "skew", "beside", "slip", "second echo", "curve", "step", "distortion",
-    "targets", "none, sound speed estimated", "lateral",
+    "targets", "none, sound speed estimated", "lateral", "marker",
+    "displaced",
 )  # fmt: skip
 SPEED_ESTIMATED = ("none, sound speed estimated", "lateral")
 IMAGES = (12, 30, 60)
 STRETCH, SKEW, BESIDE_MM, SLIP_MM, ECHO_MM, ECHO_SHARE = 1.04, 0.03, 6.0, 2.0, 5.0, 0.4
 CURVE_MM, DISTORTION_MM, METAL = 1.0, 1.0, 2.5
 APART_MM, OTHER_SHARE = 12.0, 1 / 3
+DISPLACED_MM = 2.0
+MARKER_DEG, MARKER_MM, MARKER_EDGE = 1.2, 1.0, 4.0
+"""Size of the error, and how steeply it sets in: relative to the SD of the cosine of the angle at
+which the tracker sees the markers."""
 HEADER = [
     "fault", "images", "trials", "told_of", "right", "two_targets", "good_or_fair",
     "good_and_wrong", "stated_good_and_wrong",
@@ -73,6 +82,19 @@ def dipole(key: Array, positions: Array) -> Array:
     field = (3 * along - moment) / distance**3
     field = field - field.mean(axis=0)
     return DISTORTION_MM * field / jnp.sqrt(jnp.mean(jnp.sum(field**2, axis=1)))
+
+
+def seen_wrongly(key: Array, poses: Array) -> Array:
+    """Poses of a probe whose markers are wrong from one side."""
+    # The tracker's direction, the side of the markers, and axes of the error: in two frames.
+    towards, side, axis, along = jax.random.normal(key, (4, 3))
+    cosine = poses[:, :3, :3] @ side @ towards
+    wrong = jax.nn.sigmoid(MARKER_EDGE * (cosine - cosine.mean()) / cosine.std())[:, None]
+    turn = jnp.radians(MARKER_DEG) * axis / jnp.linalg.norm(axis)
+    errors = jnp.tile(jnp.eye(4), (len(poses), 1, 1))
+    errors = errors.at[:, :3, :3].set(Rotation.from_rotvec(wrong * turn).as_matrix())
+    errors = errors.at[:, :3, 3].set(wrong * MARKER_MM * along / jnp.linalg.norm(along))
+    return poses @ errors
 
 
 @partial(jax.jit, static_argnums=(0, 1))
@@ -112,9 +134,15 @@ def draw(images: int, fault: str, indices: Array):
             apart = APART_MM * apart / jnp.linalg.norm(apart)
             other = order < round(OTHER_SHARE * images)
             poses = poses.at[:, :3, 3].add(other[:, None] * apart)
+        if fault == "displaced":
+            by = jax.random.normal(jax.random.fold_in(key, 11), (3,))
+            late = jnp.arange(images) >= 3 * images // 4
+            poses = poses.at[:, :3, 3].add(DISPLACED_MM * late[:, None] * by / jnp.linalg.norm(by))
         if fault == "distortion":
             moved = dipole(jax.random.fold_in(key, 8), poses[:, :3, 3])
             poses = poses.at[:, :3, 3].add(moved)
+        if fault == "marker":
+            poses = seen_wrongly(jax.random.fold_in(key, 10), poses)
         if fault == "curve":
             points = points.at[:, 1].add(CURVE_MM * (points[:, 0] / SIDE_MM) ** 2)
         return poses, points, x, size

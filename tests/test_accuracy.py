@@ -746,7 +746,7 @@ def test_exit_status_says_less_than_required(tmp_path, capfd):
     assert record["tre"]["points"][-1]["image"] == [3.0, 40.0]
     assert record["tre"]["unit"] == "mm"
     assert main([*ask[:-2], "1e308", "40"]) == 2
-    assert "points of --tre must be numbers up to 1e+07" in capfd.readouterr().err
+    assert "tre_points (--tre) must be numbers up to 1e+07" in capfd.readouterr().err
     noisy = tmp_path / "noisy.h5"
     protocol = jaxcal.Protocol(images=24, elevation_mm=15.0)
     jaxcal.save(jaxcal.simulate_recording(protocol, 3), noisy)

@@ -193,6 +193,18 @@ def test_every_command_is_listed_in_a_whole_line_in_the_order_of_the_work(
     assert all(words.endswith(".") and "..." not in words for _, words in listed)
 
 
+@pytest.mark.parametrize("group", [commands, bench_commands])
+def test_every_option_says_what_it_is(group):
+    """A default alone says nothing."""
+    silent, pending = [], [group]
+    for command in pending:
+        pending += getattr(command, "commands", {}).values()
+        options = [each for each in command.params if isinstance(each, click.Option)]
+        said = {option: (option.help or "").partition("[default")[0] for option in options}
+        silent += [(command.name, option.opts) for option in options if not said[option]]
+    assert not silent
+
+
 @pytest.mark.parametrize(("module", "name"), [("jaxcal", "jaxcal"), ("hw", "jaxcal-hw")])
 def test_runs_as_a_module_and_completes_in_a_shell(module, name):
     def run(*arguments, **variables):

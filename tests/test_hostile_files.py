@@ -22,7 +22,7 @@ LARGEST_GROWTH = 200e6
 RUN = """
 import contextlib, io, json, resource, sys
 from jaxcal.cli.main import main
-import numpy, h5py, PIL.Image, jaxcal.data.segmentation.image, jaxcal.io.importing
+import numpy, h5py, PIL.Image, jaxcal.data.segmentation.image, jaxcal.io.importing.files
 def rss():
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 for arguments in json.loads(sys.argv[1]):

@@ -18,10 +18,10 @@ from jaxcal.cli.main import main
 from jaxcal.data.recording import joined
 from jaxcal.io import slicer
 from jaxcal.io.columns import columns_of_header
-from jaxcal.io.importing import import_files
+from jaxcal.io.importing.files import import_files
+from jaxcal.io.importing.sources import ImportOptions
 from jaxcal.io.sequence_files import read_sequence, write_sequence
 from jaxcal.io.slicer import read_markups
-from jaxcal.io.sources import ImportOptions
 from jaxcal.io.trackers import read_tracker
 
 PROBE, REFERENCE = ("Probe", "Tracker"), ("Reference", "Tracker")
@@ -772,6 +772,37 @@ def test_points_beside_pixels_of_another_orientation(tmp_path, orientation, told
     notes = [note for note in import_files([path, tmp_path / "p.csv"])[1] if "mirrored" in note]
     assert len(notes) == (told is not None)
     assert all(f"is stored as {orientation}" in note and told in note for note in notes)
+
+
+@pytest.mark.parametrize(
+    ("name", "unset", "stated"),
+    [
+        ("s.igs.mha", b"ElementSpacing = 1 1 1", b"ElementSpacing = 0.2 0.15 1"),
+        ("s.igs.nrrd", b"(1,0) (0,1) none", b"(0,-0.2,0) (0.15,0,0) none"),
+        ("s.igs.nrrd", b"space directions: (1,0) (0,1) none", b"spacings: 0.2 0.15 NaN"),
+    ],
+)
+def test_a_pixel_size_in_the_header_is_told(tmp_path, name, unset, stated):
+    path = tmp_path / name
+    write_sequence(path, {PROBE: POSES}, np.arange(6.0), images=np.zeros((6, 500, 520), np.uint8))
+    (tmp_path / "p.csv").write_text(POINTS_OF_SIX)
+    files = [path, tmp_path / "p.csv"]
+
+    def told(**options) -> list[str]:
+        notes = import_files(files, ImportOptions(**options)).notes
+        return [note for note in notes if "its header states pixels of" in note]
+
+    assert told() == []
+    content = path.read_bytes()
+    assert content.count(unset) == 1
+    path.write_bytes(content.replace(unset, stated))
+    assert "0.2 x 0.15 mm, which is not used" in told()[0]
+    assert "--spacing 0.2 0.15" in told(spacing_mm=(0.1, 0.1))[0]
+    assert told(spacing_mm=(0.2, 0.15)) == []
+    # Slicer's points are then in mm, not in px.
+    (tmp_path / "p.fcsv").write_text(fcsv(1))
+    with pytest.raises(InputError, match=r"p\.fcsv: .*with spacing 1, .* states 0\.2 x 0\.15 mm"):
+        import_files([path, tmp_path / "p.fcsv"])
 
 
 def test_points_that_cannot_be_used_name_their_file(tmp_path, sequence):

@@ -26,14 +26,14 @@ from jaxcal.cli.main import main
 from jaxcal.cli.segment import _default_out
 from jaxcal.io.dicom import read_pixel_size
 from jaxcal.io.folder import read_folder
-from jaxcal.io.frame_poses import open_sequence
-from jaxcal.io.importing import import_files
+from jaxcal.io.importing.files import import_files
+from jaxcal.io.importing.frame_poses import open_sequence
+from jaxcal.io.importing.poses_by_time import with_poses_by_time
+from jaxcal.io.importing.sources import ImportOptions
 from jaxcal.io.picker.picks import Picks
 from jaxcal.io.png import encode_png, png_size, read_png
-from jaxcal.io.poses_by_time import with_poses_by_time
 from jaxcal.io.sequence import TrackedSequence
 from jaxcal.io.sequence_files import read_sequence, write_sequence
-from jaxcal.io.sources import ImportOptions
 
 ROWS, COLUMNS, COUNT = 110, 150, 9
 PAIR = ("Probe", "Tracker")
@@ -202,6 +202,17 @@ def test_a_mark_of_the_machine_is_told_from_a_target(tmp_path, capsys):
         main(["import", str(path), str(tmp_path / "f.h5")])
         said = " ".join(capsys.readouterr().out.split())
         assert ("in 6 of 9 frames the target is at the same place" in said) == told
+
+
+def test_a_tail_of_echoes_behind_the_target_is_told(tmp_path, capsys):
+    """The points were 1.8 mm too deep, and nothing said so."""
+    path = tmp_path / "f.igs.mha"
+    for echoes, told in ((1, False), (5, True)):
+        frames = [np.max([np.roll(each, 2 * k, 0) for k in range(echoes)], 0) for each in FRAMES]
+        write_sequence(path, {PAIR: POSES}, np.arange(COUNT) / 20, images=frames)
+        main(["segment", str(path)])
+        said = " ".join(capsys.readouterr().out.split())
+        assert ("in 8 of 8 frames the target is longer in depth than across" in said) == told
 
 
 def test_segment_of_a_folder_that_does_not_exist_blames_no_option(tmp_path, capsys):

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from jaxcal import FormatError, InputError
 from jaxcal.io import lines as text_files
 from jaxcal.io import table
-from jaxcal.io.frame_poses import tool_poses
-from jaxcal.io.sources import ImportOptions
+from jaxcal.io.importing.frame_poses import tool_poses
+from jaxcal.io.importing.sources import ImportOptions
 from jaxcal.io.text import read_crosswire, read_pose_table, recording_of
 
 CROSSWIRE = Path(__file__).parents[2] / "shared" / "data" / "crosswire"

@@ -7,7 +7,9 @@ only where they are listed here.
 from __future__ import annotations
 
 import ast
+import re
 from collections import defaultdict
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -83,6 +85,12 @@ def sources() -> dict[str, Path]:
     return found
 
 
+@cache
+def parsed(path: Path) -> ast.Module:
+    """A module's tree; several tests read it."""
+    return ast.parse(path.read_bytes())
+
+
 def imports_of(path: Path, modules: dict[str, Path]) -> tuple[set[str], set[str]]:
     """Modules that a file imports at its head, TYPE_CHECKING included, and within functions."""
     head: set[str] = set()
@@ -103,7 +111,7 @@ def imports_of(path: Path, modules: dict[str, Path]) -> tuple[set[str], set[str]
             if isinstance(child, ast.stmt | ast.ExceptHandler | ast.match_case):
                 visit(child, found)
 
-    visit(ast.parse(path.read_bytes()), head)
+    visit(parsed(path), head)
     return head, late
 
 
@@ -199,7 +207,7 @@ def test_jax_is_imported_before_its_parts():
     """
     early = []
     for path in sources().values():
-        nodes = list(ast.walk(ast.parse(path.read_text())))
+        nodes = list(ast.walk(parsed(path)))
         guards = [each for each in nodes if isinstance(each, ast.If)]
         unseen = {
             id(each)
@@ -223,6 +231,51 @@ def test_jax_is_imported_before_its_parts():
             if not whole and any(name.startswith("jax.") for name in names):
                 early.append(f"{path.relative_to(HOME)}:{node.lineno}")
     assert not early
+
+
+REFERENCE = re.compile(r":(?:mod|class|func|meth|data|attr|exc):`([A-Za-z_][\w.]*)`")
+"""What a docstring refers to: by its full name, or by one that its own module knows."""
+OTHERS = {"jax", "optimistix", "socket"}
+"""Packages of others that are referred to by their full names."""
+
+
+def names_in(body: list[ast.stmt], *, members: bool = True) -> set[str]:
+    """Names that a module defines or imports at its head, and members of its classes."""
+    found: set[str] = set()
+    for node in body:
+        if isinstance(node, ast.If | ast.Try):
+            found |= names_in(node.body, members=members)
+        elif isinstance(node, ast.ClassDef | ast.FunctionDef):
+            found.add(node.name)
+            if members and isinstance(node, ast.ClassDef):
+                found |= names_in(node.body)
+        elif isinstance(node, ast.Import | ast.ImportFrom):
+            found.update(each.asname or each.name for each in node.names)
+        elif isinstance(node, ast.Assign | ast.AnnAssign):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            names = (name for target in targets for name in ast.walk(target))
+            found.update(name.id for name in names if isinstance(name, ast.Name))
+    return found
+
+
+def test_docstrings_refer_to_what_is_there():
+    modules = sources()
+    known: dict[tuple[str, bool], set[str]] = {}
+    missing = []
+    for here, path in modules.items():
+        for target in REFERENCE.findall(path.read_text("utf-8")):
+            parts = target.split(".")
+            lengths = range(len(parts), 0, -1)
+            full = (name for k in lengths if (name := ".".join(parts[:k])) in modules)
+            module = next(full, here)
+            own = parts[0] not in ("jaxcal", "hw")
+            first = parts[0] if own else target[len(module) + 1 :].split(".")[0]
+            if (module, own) not in known:
+                found = names_in(parsed(modules[module]).body, members=own)
+                known[module, own] = found | (OTHERS if own else {""})
+            if first not in known[module, own]:
+                missing.append(f"{here}: {target}")
+    assert not missing
 
 
 LINUX_ONLY = ("hw.robot.mover", "hw.robot.motion", "hw.bench")

@@ -120,12 +120,15 @@ def test_numbers_are_those_of_the_record(tags, record):
 def test_small_errors_are_not_zero_and_estimates_are_told(record, result, recording):
     tre = {**record["tre"], "rms_mm": 0.0039, "interval_95_mm": [0.0014, 0.0074]}
     found = {"sound_speed_m_s": 1490.43, "sound_speed_sd_m_s": 0.86,
-             "delay_s": -2.14e-8, "delay_sd_s": None}  # fmt: skip
+             "delay_s": -2.14e-8, "delay_sd_s": None,
+             "image_unknowns": [*record["image_unknowns"], "delay_mm"],
+             "image_covariance": (0.04 * np.eye(7)).tolist()}  # fmt: skip
     text = page({**record, **found, "tre": tre}, result, recording)
     assert ">0.0039</span>" in text
     assert ">0.0014</span>" in text
     assert "1490.4 ± 0.9<" in text
     assert "-0.021 ± -<" in text
+    assert ">0.2 mm of distance<" in text
 
 
 def test_matrix_to_copy_is_the_one_that_is_exported(tags, result, tmp_path):

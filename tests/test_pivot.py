@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 import jaxcal
 from jaxcal import InputError
 from jaxcal.cli.main import main
-from jaxcal.io.frame_poses import tool_poses
+from jaxcal.io.importing.frame_poses import tool_poses
+from jaxcal.io.importing.sources import ImportOptions
 from jaxcal.io.sequence_files import write_sequence
-from jaxcal.io.sources import ImportOptions
 from jaxcal.io.text import read_poses
 
 TIP, POINT = np.array([3.0, -20.0, 150.0]), np.array([100.0, -200.0, 900.0])
@@ -188,6 +188,16 @@ def test_a_batch_of_rows_without_the_last_one():
     with pytest.raises(jaxcal.InputError, match="a batch holds many"):
         found.record()
     assert str(found).startswith("Pivot(")
+
+
+def test_a_batch_with_a_problem_of_too_few_poses_says_which():
+    poses = np.stack([swung(random_rotations(12, seed), 0.1, seed) for seed in range(2)])
+    found = jaxcal.calibrate_pivot(poses, np.arange(12) < [[12], [3]], robust=False)
+    np.testing.assert_array_equal(found.status, ["converged", "failed"])
+    np.testing.assert_array_equal(np.isnan(found.covariance).all(axis=(1, 2)), [False, True])
+    assert np.isfinite(found.covariance[0]).all()
+    for_all = jaxcal.calibrate_pivot(poses, np.arange(12) < 3, robust=False)
+    np.testing.assert_array_equal(for_all.status, ["failed", "failed"])
 
 
 def test_bad_input_is_named():

@@ -188,6 +188,36 @@ def test_number_types_and_a_saturated_display_leave_the_position():
     np.testing.assert_allclose(located.position[0], place, atol=0.2)
 
 
+def test_clutter_below_the_face_leaves_the_covariance():
+    """A bright band across the frame is no speckle: it once made the lateral SD far too small."""
+    rng, shape = np.random.default_rng(41), (160, 136)
+    places = np.array(shape)[::-1] / 2 + rng.uniform(-8, 8, (24, 2))
+    band = 16.0 * (np.arange(shape[0])[:, None] < 12)
+    target = np.sqrt(2) * 10 ** (30 / 20)
+    fields = [speckle(rng, shape) + band + target * ridge(place, shape=shape) for place in places]
+    located = localise(np.stack([display(field) for field in fields]))
+    assert located.found.all(), set(located.reason)
+    # With a right covariance the mean of 24 is 2 with an SD of 0.41. The band also makes the range
+    # of the display look smaller, and so the SDs larger: that is the safe side.
+    assert normalised(located.position - places, located.covariance).mean() < 3.2
+
+
+def test_a_spot_cut_off_by_the_edge_of_a_sector_is_refused():
+    """Black corners are a border as well; a spot beside them is whole, and is found."""
+    rng = np.random.default_rng(43)
+    v, u = np.indices(SHAPE)
+    inside = u - 50.0 > 0.6 * (v - 48)
+    for gap, background in ((1.0, 0.01), (1.0, 1.0), (12.0, 0.01), (12.0, 1.0)):
+        place = np.array([50.0 + gap, 48.0])
+        frame = display(background * speckle(rng) + 45 * ridge(place)) * inside.astype(np.uint8)
+        located = localise(frame)
+        assert located.found[0] == (gap > 1)
+        if gap > 1:
+            np.testing.assert_allclose(located.position[0], place, atol=0.4)
+        else:
+            assert "edge of the image" in located.reason[0]
+
+
 def test_target_scatter_is_added():
     frames, _ = draw("echo", 2, 30.0, seed=19)
     plain, more = localise(frames), localise(frames, target_sd_px=(2.0, 0.5))

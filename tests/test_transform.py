@@ -466,6 +466,20 @@ def test_apply_with_pose_and_covariance():
     np.testing.assert_allclose(applied.covariance[0], spread, atol=0.03 * np.trace(spread))
 
 
+def test_places_in_the_image_plane_and_back():
+    """The estimated sound speed makes pixels longer along the beam."""
+    known = replace(random_transform(7, offset=1.5), range_factor=1.04)
+    pixels = np.array([[300.0, 410.0], [-20.0, 3.0]])
+    size = known.scale_mm_per_px * [1.0, 1.04]
+    np.testing.assert_allclose(known.pixel_size_mm(), size)
+    places = known.in_plane(pixels)
+    np.testing.assert_allclose(places[:, [0, 2]], pixels * size + [0.0, 1.5])
+    assert not places[:, 1].any()
+    np.testing.assert_allclose(known.image_points(places[:, [0, 2]]), pixels)
+    with pytest.raises(InputError, match="no pixel size is known"):
+        random_transform(scale=None).pixel_size_mm()
+
+
 def test_pixels_for_a_calibration_in_mm():
     known = random_transform(scale=None, offset=0.0)
     with_pixels = known.with_pixels((0.2, 0.1), (64.0, -10.0))
@@ -589,6 +603,11 @@ def test_json_that_lies(tmp_path, change, message):
     assert str(caught.value).startswith(str(tmp_path / "c.json"))
 
 
+NEARLY_PARALLEL = np.eye(4)
+"""Rows and columns of pixels along one direction: by rounding, its cosine with itself exceeds 1."""
+NEARLY_PARALLEL[:3, :3] = 0.1 * np.array([[1, 1, -1], [2, 2 + 1e-9, 0], [1, 1, 0]])
+
+
 @pytest.mark.parametrize(
     ("matrix", "message"),
     [
@@ -600,6 +619,7 @@ def test_json_that_lies(tmp_path, change, message):
         (np.diag([0.1, np.nan, 0.1, 1]), "finite"),
         (np.diag([0.1, 0.1, 0.1, 2]), "last row"),
         (np.eye(4) + np.pad([[0.1]], ((0, 3), (1, 2))), "degrees apart: fCal fitted"),
+        (NEARLY_PARALLEL, "are 0.000 degrees apart"),
         (random_transform().image_plane_to_probe, "the matrix is rigid, as if a pixel measured"),
     ],
 )
@@ -980,7 +1000,7 @@ def test_no_jax(saved, tmp_path):
         "assert len(jaxcal.load(sys.argv[2] + '/r.h5')) == 8\n"
         "assert main(['apply', sys.argv[1], sys.argv[2] + '/r.h5', '--out', "
         "sys.argv[2] + '/p.csv']) == 0\n"
-        "import jaxcal.io.importing, jaxcal.io.plus, jaxcal.io.trackers, jaxcal.io.serving\n"
+        "import jaxcal.io.importing.files, jaxcal.io.plus, jaxcal.io.trackers, jaxcal.io.serving\n"
         "loaded = {name.split('.')[0] for name in sys.modules}\n"
         "assert not loaded & {'jax', 'jaxlib', 'equinox', 'optimistix', 'matplotlib'}, loaded\n"
     )

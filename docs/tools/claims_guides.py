@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from claims import Row, claim, column, number, percent, table
 
+from hw.robot.limits import CALLER_S
+
 SAFETY, POSES, TRUST = "docs/safety.md", "docs/how-to/poses.md", "docs/understand/trust.md"
 
 WAYS = {
@@ -32,6 +34,8 @@ claim(
     "{:.0f} of {:,.0f} stops were lost",
     lambda: [sum(number(row, name) for row in table("stops")) for name in ("lost", "trials")],
 )
+claim(SAFETY, "acquisition's process was silent for {:g} s | hesitation", lambda: [CALLER_S])
+claim(SAFETY, "after {:g} s without a sign of life", lambda: [CALLER_S])
 
 _PROMPT = [row for row in table("robot_faults") if row["fault"] != "lost answers"]
 claim(

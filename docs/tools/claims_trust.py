@@ -1,10 +1,7 @@
-"""Claims of the page on accuracy: further laws, stated errors, jumps, held probes, false alarms."""
+"""Claims of the page on accuracy: further laws, stated errors, jumps, held probes, bounds."""
 
 from __future__ import annotations
 
-import itertools
-
-import numpy as np
 from claims import ACCURACY, INDEX, Row, claim, column, number, only, percent, span, table
 
 MIXTURE = {"elevation_distribution": "sometimes off-centre"}
@@ -213,6 +210,34 @@ def _good() -> list[float]:
 
 
 claim(ACCURACY, "and in {:.1f} to {:.1f} % of the sweeps.", _good)
+KEPT, ONE_OF_A_TIME = "2.5, at least 60", "1 of a time"
+
+
+def _one_of_a_time() -> list[float]:
+    few, kept = (column("stream_images", "error_mm", kept=rule) for rule in (ONE_OF_A_TIME, KEPT))
+    if any(column("stream_images", "refused", kept=KEPT)):
+        raise ValueError("the page says that none are refused with these")
+    more = span(one / other for one, other in zip(few, kept, strict=True))
+    return [*more, max(column("stream_images", "refused", kept=ONE_OF_A_TIME))]
+
+
+claim(
+    ACCURACY,
+    "the error of X's translation (RMS) is {:.1f} to {:.1f} times as large as with the images that "
+    "`calibrate` keeps, and up to {:.0f} of the 200 recordings are refused,",
+    _one_of_a_time,
+)
+claim(
+    ACCURACY,
+    "With these images the intervals contain the truth in {:.1f} to {:.1f} %, with all images in "
+    "{:.1f} to {:.1f} %.",
+    lambda: percent(
+        [
+            *span(column("stream_images", "cover_95_mean", kept=KEPT)),
+            *span(column("stream_images", "cover_95_mean", kept="all")),
+        ]
+    ),
+)
 claim(
     ACCURACY,
     "In these the error of X's translation is {:.2f} to {:.2f} mm (RMS), and {:.2f} to {:.2f} mm "
@@ -223,141 +248,6 @@ claim(
     ],
 )
 
-
-# False alarms.
-def _suspects(of: str, fault: str, *images: str) -> tuple[float, float]:
-    return span(percent(column("suspects", of, fault=fault, images=images)))
-
-
-claim(
-    ACCURACY,
-    "in {:.1f} to {:.1f} % of the recordings with 30 and 54 images; with 200 it is {:.1f} to "
-    "{:.1f} %,",
-    lambda: (*_suspects("suspects", "none", "30", "54"), *_suspects("suspects", "none", "200")),
-)
-claim(
-    ACCURACY,
-    "are named in {:.1f} to {:.1f} % of the recordings of 30 images, in {:.1f} to {:.1f} % of "
-    "those of 54.",
-    lambda: (
-        *_suspects("fault_named", "three images", "30"),
-        *_suspects("fault_named", "three images", "54"),
-    ),
-)
-
-
-# Errors that the model leaves out.
-FAULTS = (
-    "scale", "skew", "beside", "slip", "second echo", "curve", "step", "distortion",
-    "targets", "lateral",
-)  # fmt: skip
-
-
-def _left_out(of: str, *images: str) -> tuple[float, float]:
-    return span(percent(column("unmodelled", of, fault=FAULTS, images=images)))
-
-
-claim(
-    ACCURACY,
-    "clean recordings {:.1f} to {:.1f} % are reported to have such an error, and of those with the "
-    "sound speed estimated {:.1f} to {:.1f} %.",
-    lambda: (
-        *span(percent(column("unmodelled", "told_of", fault="none"))),
-        *span(percent(column("unmodelled", "told_of", fault="none, sound speed estimated"))),
-    ),
-)
-claim(
-    ACCURACY,
-    "The fault is named in {:.1f} to {:.1f} % of the recordings with 30 and 60 images, in {:.1f} "
-    "to {:.1f} % of those with 12.",
-    lambda: (*_left_out("right", "30", "60"), *_left_out("right", "12")),
-)
-claim(
-    ACCURACY,
-    "end of its 95 % interval in at most {:.1f} % with 30 and 60 images (by the covariance alone: "
-    "{:.1f} to {:.1f} %), and in up to {:.1f} % with 12 ({:.1f} to {:.1f} %).",
-    lambda: (
-        _left_out("good_and_wrong", "30", "60")[1],
-        *_left_out("stated_good_and_wrong", "30", "60"),
-        _left_out("good_and_wrong", "12")[1],
-        *_left_out("stated_good_and_wrong", "12"),
-    ),
-)
-claim(
-    ACCURACY,
-    "The distortion is named in {:.1f} % of the recordings with 12 images, {:.1f} % with 30 and "
-    "{:.1f} % with 60.",
-    lambda: percent(column("unmodelled", "right", fault="distortion")),
-)
-
-claim(
-    ACCURACY,
-    "Two targets are named in {:.1f} % of the recordings with 30 images that show them and in "
-    "{:.1f} % with 60, and in at most {:.1f} % of the clean ones.",
-    lambda: (
-        *percent(column("unmodelled", "right", fault="targets", images=("30", "60"))),
-        max(percent(column("unmodelled", "two_targets", fault="none"))),
-    ),
-)
-
-
-# Images that lag behind their poses.
-def _lag(of: str, *lags: str) -> tuple[float, float]:
-    return span(column("lag", of, lag_s=lags))
-
-
-claim(
-    ACCURACY,
-    "Without a lag, the import tells of one in at most {:.1f} % of the recordings, and the verdict "
-    "names one in at most {:.1f} %.",
-    lambda: percent(_lag(of, "0")[1] for of in ("told_at_import", "told_by_verdict")),
-)
-claim(
-    ACCURACY,
-    "A lag of 20 ms is named by the verdict in at least {:.1f} %, of 50 or 100 ms in at least "
-    "{:.1f} %; the import tells of 50 ms in at least {:.1f} %, of 100 ms in at least {:.1f} %.",
-    lambda: percent(
-        [
-            _lag("told_by_verdict", "0.02")[0],
-            _lag("told_by_verdict", "0.05", "0.1")[0],
-            _lag("told_at_import", "0.05")[0],
-            _lag("told_at_import", "0.1")[0],
-        ]
-    ),
-)
-claim(
-    ACCURACY,
-    "The lags that the verdict names are {:.1f} to {:.1f} ms off (RMS), those of the import {:.1f} "
-    "to {:.1f} ms.",
-    lambda: [
-        1000 * error
-        for of in ("verdict_error_s", "import_error_s")
-        for error in _lag(of, "0.02", "0.05", "0.1", "0.2")
-    ],
-)
-claim(
-    ACCURACY,
-    "With a lag of 100 ms the verdict is good or fair in {:.1f} to {:.1f} %; with the lag of the "
-    "import stated, the median error falls from {:.2f} to {:.2f} mm to {:.2f} to {:.2f} mm, where "
-    "recordings without a lag have {:.2f} to {:.2f} mm.",
-    lambda: (
-        *percent(_lag("good_or_fair", "0.1")),
-        *_lag("error_mm", "0.1"),
-        *_lag("error_once_stated_mm", "0.1"),
-        *_lag("error_mm", "0"),
-    ),
-)
-claim(
-    ACCURACY,
-    "is named as poses that are out of step in at least {:.1f} %. The verdict is good or fair "
-    "although the error exceeds the upper end of its 95 % interval in at most {:.1f} %.",
-    lambda: percent(
-        [
-            min(column("lag", "other_told", images="100", lag_s="0.2")),
-            max(column("lag", "good_and_wrong")),
-        ]
-    ),
-)
 
 # Bounded and uniform offsets.
 claim(
@@ -392,204 +282,3 @@ def _of_uniform(of: str, bound: str) -> list[float]:
 def _over_gaussian(bound: str) -> tuple[float, float]:
     errors, others = (_of_uniform(of, bound) for of in ("error_mm", "gaussian_error_mm"))
     return span([a / b for a, b in zip(errors, others, strict=True)])
-
-
-# The bench.
-def _bench(poses: str, *columns: str) -> list[float]:
-    return [only("pose_design_benches", name, poses=poses) for name in columns]
-
-
-def _bounds() -> list[float]:
-    """The least TRE over that of random poses, and how far above it the plans are at most, in %."""
-    planned, least = (
-        np.array(column("pose_design_bound", f"{name}_over_random"))
-        for name in ("planned", "least")
-    )
-    return [*least, max(100 * (planned / least - 1))]
-
-
-claim(
-    ACCURACY,
-    "is at least {:.2f}, {:.2f}, {:.2f} and {:.2f} of that of random poses (8, 12, 30 and 60 "
-    "images, 40 degrees), and {:.2f}, {:.2f}, {:.2f} and {:.2f} (10 degrees); the plans are "
-    "at most {:.1f} % above",
-    _bounds,
-)
-
-
-def _foreseen(of: str, *laws: str) -> tuple[float, float]:
-    return span(
-        column("pose_design_predicted", f"{of}_over_actual", **({"law": laws} if laws else {}))
-    )
-
-
-claim(
-    ACCURACY,
-    "predicts a TRE that is {:.2f} to {:.2f} times the actual one of `auto`, in {:.0f} cells of "
-    "{:.0f} recordings: five distributions, planned and random poses, both limits of tilt, {:.0f} "
-    "to {:.0f} images",
-    lambda: (
-        *_foreseen("simulated"),
-        len(column("pose_design_predicted", "simulated_over_actual")),
-        *set(column("pose_design_predicted", "trials")),
-        *span(column("pose_design_predicted", "images")),
-    ),
-)
-claim(
-    ACCURACY,
-    "It is {:.2f} to {:.2f} times the actual TRE for normal, triangular and heavy-tailed offsets, "
-    "up to {:.2f} times for uniform ones, whose edges `auto` finds in many images, and {:.2f} to "
-    "{:.2f} times for one-sided ones,",
-    lambda: (
-        *_foreseen("planned", "normal", "triangular", "heavy-tailed"),
-        _foreseen("planned", "uniform")[1],
-        *_foreseen("planned", "one-sided"),
-    ),
-)
-
-
-BOTH = ("tre_mm", "tre_error_mm")
-claim(
-    ACCURACY,
-    "TRE {:.3f} +- {:.3f} mm against {:.3f} +- {:.3f}, RP {:.3f} +- {:.3f} mm against {:.3f} +- "
-    "{:.3f} (one standard error). 36 of the Sobol plan: {:.3f} mm.",
-    lambda: (
-        *_bench("optimal 36", *BOTH),
-        *_bench("sobol 60", *BOTH),
-        *_bench("optimal 36", "rp_mm", "rp_error_mm"),
-        *_bench("sobol 60", "rp_mm", "rp_error_mm"),
-        *_bench("sobol 36", "tre_mm"),
-    ),
-)
-claim(
-    ACCURACY,
-    "On {:.0f} emulated benches 36 planned poses",
-    lambda: _bench("optimal 36", "benches"),
-)
-
-
-def _one_sided() -> tuple[float, float]:
-    ratios = column(
-        "pose_design",
-        "predicted_over_actual",
-        law="one-sided",
-        method="auto",
-        images=("8", "12", "30"),
-        poses=("random", "optimal"),
-    )
-    return span(1 / ratio for ratio in ratios)
-
-
-claim(
-    ACCURACY,
-    "up to 30 images the actual TRE is {:.1f} to {:.1f} times what `auto` predicts,",
-    _one_sided,
-)
-
-
-def _over_five_laws(of: str, cone: str) -> float:
-    """The largest over the numbers of images, of the mean over the laws."""
-    where = {"cone": cone, "poses": "optimal", "method": "auto"}
-    counts = (column("pose_design", of, images=images, **where) for images in ("12", "30", "60"))
-    return max(sum(values) / len(values) for values in counts)
-
-
-claim(
-    ACCURACY,
-    "the mean of the five ratios (planned to random poses) is at most {:.2f} (TRE) and {:.2f} "
-    "(RP) with 40 degrees, {:.2f} and {:.2f} with 10 degrees.",
-    lambda: [
-        _over_five_laws(of, cone)
-        for cone in ("wide", "narrow")
-        for of in ("tre_over_random", "rp_over_random")
-    ],
-)
-
-
-SYMMETRIC = ("uniform", "normal", "heavy-tailed", "triangular")
-
-
-def _standard_errors(*arms: str) -> tuple[float, float]:
-    """Of the table's ratios of root mean squares over the laws, in %."""
-    found = []
-    for arm, cone, images, of in itertools.product(
-        arms, ("wide", "narrow"), ("12", "30", "60"), ("tre", "rp")
-    ):
-        squared = 0.0
-        for poses in (arm, "random"):
-            where = {"cone": cone, "images": images, "poses": poses, "method": "auto"}
-            means, errors = (
-                np.array(column("pose_design", f"{of}_{what}", law=SYMMETRIC, **where))
-                for what in ("mm", "error_mm")
-            )
-            squared += np.sum((means * errors) ** 2) / np.sum(means**2) ** 2
-        found.append(100 * squared**0.5)
-    return span(found)
-
-
-claim(
-    ACCURACY,
-    "One standard error is {:.1f} to {:.1f} % (re-planned: {:.1f} to {:.1f} %).",
-    lambda: (
-        *_standard_errors("sobol", "optimal", "wrong+", "wrong-"),
-        *_standard_errors("replanned"),
-    ),
-)
-
-
-def _filled(of: str, *shares: str, poses: str = "planned") -> list[float]:
-    """Of the recordings whose ranges are too long towards the sides."""
-    where = {"poses": poses, "curve_mm": "1", "space_filling": shares}
-    return list(span(column("plan_faults", of, **where)))
-
-
-claim(
-    ACCURACY,
-    "If no planned pose fills space, the error is reported in {:.0f} to {:.0f} % of the "
-    "recordings, and in {:.0f} to {:.0f} % the verdict is good or fair although the error exceeds "
-    "the upper end of its 95 % interval. If a tenth fills space, these are {:.0f} to {:.0f} % and "
-    "at most {:.1f} %; if a fifth does, {:.0f} % and {:.0f} %.",
-    lambda: [
-        *percent(_filled("told_of", "0")),
-        *percent(_filled("good_and_wrong", "0")),
-        *percent(_filled("told_of", "0.1")),
-        *percent(_filled("good_and_wrong", "0.1")[1:]),
-        *percent(_filled("told_of", "0.2")[:1]),
-        *percent(_filled("good_and_wrong", "0.2")[1:]),
-    ],
-)
-claim(
-    ACCURACY,
-    "{:.2f} to {:.2f} mm (TRE, a fifth fills space), at random poses by {:.2f} to {:.2f} mm.",
-    lambda: (*_filled("tre_mm", "0.2"), *_filled("tre_mm", "", poses="random")),
-)
-
-
-# The certificate.
-def _certified(*images: str) -> float:
-    where = {"family": "all", "estimate": "all", "images": images}
-    sums = [sum(column("closed_form_study", name, **where)) for name in ("certified", "problems")]
-    return 100 * sums[0] / sums[1]
-
-
-def _none(name: str) -> None:
-    if only("closed_form_study", name, family="all", estimate="all", images="4-50"):
-        raise ValueError(f"the page says that closed_form_study has none that is {name}")
-
-
-def _closed_form() -> list[float]:
-    _none("above_64_descents")
-    _none("false_certificates")
-    whole = {"family": "all", "estimate": "all", "images": "4-50"}
-    problems = only("closed_form_study", "problems", **whole)
-    return [problems, _certified("8"), _certified("12-19", "20-50")]
-
-
-claim(
-    ACCURACY,
-    "compares {:,.0f} random problems, degenerate ones among them, with Levenberg-Marquardt from "
-    "64 starts. In none of them is the closed form above its best by more than 1e-9, and no "
-    "certificate is false. A certificate is found for {:.2f} % of the problems with 8 images and "
-    "{:.2f} % of those with 12 or more.",
-    _closed_form,
-)

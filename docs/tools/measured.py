@@ -14,10 +14,12 @@ import sys
 
 # These register their claims.
 import claims_accuracy  # noqa: F401
+import claims_bench  # noqa: F401
 import claims_guides  # noqa: F401
 import claims_paper  # noqa: F401
 import claims_speed  # noqa: F401
 import claims_trust  # noqa: F401
+import claims_unmodelled  # noqa: F401
 from claims import ACCURACY, CLAIMS, EXPERIMENT, INDEX, PAGES, PAPER, README, ROOT, SPEED
 
 SETTINGS: dict[str, tuple[str, ...]] = {
@@ -30,7 +32,7 @@ SETTINGS: dict[str, tuple[str, ...]] = {
         "Python 3.11 to 3.14",
         "BSD 3-clause",
     ),
-    INDEX: ("from 22 to 28 November 2026", "a machine with 16 cores", "some with only 8 images"),
+    INDEX: ("from 22 to 29 November 2026", "a machine with 16 cores", "some with only 8 images"),
     ACCURACY: (
         "+- is a 95 % interval",
         "7 x 7 grid of offsets and noise, for five distributions of the offsets, with 50 images",
@@ -64,7 +66,8 @@ SETTINGS: dict[str, tuple[str, ...]] = {
         "outside a 99 % interval",
         "with 4 to 20 poses",
         "250 clean recordings for each of three distributions and 30, 54 and 200 images",
-        "1000 clean recordings each of 12, 30 and 60 images, and 200 each with one of ten faults",
+        "1000 clean recordings each of 12, 30 and 60 images, and 200 each with one of twelve "
+        "faults",
         "at about 40 mm/s, 30 poses a second; 300 recordings without a lag and 60 with each lag, "
         "of 20 images, one a second, of 40, one every 0.9 s, and of 100, one every 0.2 s",
         "A lag of 20 ms is named",

@@ -64,19 +64,6 @@ ESTIMATE = "X at ("
 """What ``jaxcal-hw acquire`` says with its first estimate."""
 
 
-EACH_IMAGE = (
-    "poses",
-    "measurements",
-    "mask",
-    "covariance",
-    "max_elevation",
-    "amplitude",
-    "time",
-    "time_of_flight",
-)
-"""What a recording holds for each image."""
-
-
 @dataclass(frozen=True)
 class Case:
     """Something that a person runs.
@@ -97,6 +84,7 @@ class Case:
 def recordings(folder: Path) -> tuple[Path, Path, Path, Path]:
     """Cross-wire points and times of flight, whole and cut."""
     import jaxcal
+    from jaxcal.data.recording import OF_SOME
     from jaxcal.io.text import read_crosswire
 
     if DATA.is_dir():
@@ -114,6 +102,7 @@ def recordings(folder: Path) -> tuple[Path, Path, Path, Path]:
         images=CHANNEL_IMAGES, elevation_mm=2.0, noise_mm=0.5, probe=probe, raw=True
     )
     raw = jaxcal.simulate_recording(protocol, SEED)
+    of_each_image = ("poses", "measurements", "mask", "velocity", *OF_SOME)
     paths = []
     for name, recording, count in (
         ("points", whole, IMAGES),
@@ -124,7 +113,7 @@ def recordings(folder: Path) -> tuple[Path, Path, Path, Path]:
         images = recording.calibration
         rows = {
             key: None if getattr(images, key) is None else getattr(images, key)[:count]
-            for key in EACH_IMAGE
+            for key in of_each_image
         }
         paths.append(folder / f"{name}.h5")
         # What is known of all images does not fit to a part of them.

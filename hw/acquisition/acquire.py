@@ -284,7 +284,7 @@ class _Run:
             now = described_electronics(session.echo)
             for change in compare_electronics(job.progress.electronics, now):
                 self._note("changed", change)
-        check_sample(session.poses.latest(), plan.limits, self.clock)
+        check_sample(session.poses.awaited(), plan.limits, self.clock)
         course = check_plan(plan)
         reach = NOT_CHECKED if course is None else f"{plan.limits.arm_model}: {course.text}"
         self._note("arm", reach)
@@ -347,7 +347,7 @@ class _Run:
         planner = Planner(job.targets, job.setup, job.request.until_tre_mm)
         left = job.missing
         while left and estimator.count < job.images:
-            here = session.poses.latest().pose
+            here = session.poses.awaited().pose
             choice = planner.choose(left, estimator.poses, here, estimator.answer)
             if choice.text:
                 self._note("planned", choice.text)

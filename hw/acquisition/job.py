@@ -126,7 +126,7 @@ def motion_plan(job: Job, session: Session) -> MotionPlan:
     if pendant is None:
         raise refused("the controller does not report its speed slider")
     limits = job.setup.motion_limits(controller_arm(identity.model, identity.version))
-    here = session.poses.latest()
+    here = session.poses.awaited()
     whole = MotionPlan(job.targets, limits, offset, identity.name, here.joints, pendant)
     # The order in which poses of a pool are visited is not known yet.
     return plan_to_go(whole, job.missing, here.pose) if job.request.plan == "sobol" else whole

@@ -78,7 +78,7 @@ class ProbeStage:
         except RefusedError as error:
             if self._motion.ended:  # refused while it moved, for good: no other way helps
                 raise
-            here = self._session.poses.latest().pose
+            here = self._session.poses.awaited().pose
             near = int(np.argmin([apart(here, pose) for pose in self._targets]))
             if near == row:
                 raise

@@ -36,6 +36,7 @@ from hw.active_echo.codec import (
 from hw.active_echo.transport import BAUD, DEVICE, open_transport
 from hw.runtime.clock import REAL, Clock
 from hw.runtime.errors import DeviceError, LostError, RefusedError, StaleError
+from hw.runtime.interrupts import lock_and_condition
 from jaxcal.runtime.array_types import Float
 
 COMMAND_TIMEOUT_S = 1.0
@@ -118,7 +119,7 @@ class ActiveEcho:
             raise DeviceError(f"the queue must hold a frame at least, not {queue}", device=DEVICE)
         self.url, self.lines, self._clock = url, lines, clock
         self._decoder = Decoder(Mode.UNKNOWN)
-        self._changed = threading.Condition()
+        self._lock, self._changed = lock_and_condition()
         self._asking = threading.Lock()
         self._frames: deque[EchoFrame] = deque(maxlen=queue)
         self._replies: deque[Reply] = deque(maxlen=64)
@@ -147,7 +148,7 @@ class ActiveEcho:
         # A program that was killed may have left it answering: every image would show that.
         self.inject(False)
         self._tick_s = 1.0 / self.clock_hz()
-        with self._changed:
+        with self._lock:
             self._frames.clear()
             self._decoder.damaged = self._decoder.resynchronised = 0
             self._counts = EchoStatistics()
@@ -230,7 +231,7 @@ class ActiveEcho:
         """Ask for the device's frame count, so that the delay of the next frames is known."""
         sent = self._clock.now()
         _, frames = self.trigger_count()
-        with self._changed:
+        with self._lock:
             self._asked = sent, frames
 
     def device_error(self) -> str | None:
@@ -241,7 +242,7 @@ class ActiveEcho:
     def stream(self, on: bool) -> None:
         """Have the device send frames, or not."""
         state = "ON" if on else "OFF"
-        with self._changed:
+        with self._lock:
             self._last_frame = None
         self._ask("STRM", state, expected=state)
 
@@ -257,7 +258,7 @@ class ActiveEcho:
             StaleError: no frame in time.
             LostError: the device is gone; frames that came before are handed out first.
         """
-        with self._changed:
+        with self._lock:
             self._changed.wait_for(
                 lambda: self._frames or self._failure, self._clock.wall(timeout_s)
             )
@@ -273,7 +274,7 @@ class ActiveEcho:
         Raises:
             LostError: the device is gone and no frame waits.
         """
-        with self._changed:
+        with self._lock:
             frames = list(self._frames)
             self._frames.clear()
             if not frames and self._failure is not None:
@@ -282,7 +283,7 @@ class ActiveEcho:
 
     def statistics(self) -> EchoStatistics:
         """Counts since the port was opened."""
-        with self._changed:
+        with self._lock:
             decoder = self._decoder
             return replace(
                 self._counts,
@@ -324,7 +325,7 @@ class ActiveEcho:
         """
         with self._asking:
             for attempt in range(attempts):
-                with self._changed:
+                with self._lock:
                     self._replies.clear()
                     if attempt:
                         # The reply that was missed may have been one that changes the mode.
@@ -352,7 +353,7 @@ class ActiveEcho:
         other: str | None = None
         wait = max(self._clock.wall(COMMAND_TIMEOUT_S), _SHORTEST_WAIT_S)
         deadline = time.monotonic() + wait
-        with self._changed:
+        with self._lock:
             while True:
                 while self._replies:
                     reply = self._replies.popleft()
@@ -376,14 +377,14 @@ class ActiveEcho:
             try:
                 data = self._transport.read()
             except LostError as error:
-                with self._changed:
+                with self._lock:
                     self._failure = error
                     self._changed.notify_all()
                 return
             if not data:
                 continue
             now = self._clock.now()
-            with self._changed:
+            with self._lock:
                 for item in self._decoder.feed(data):
                     if isinstance(item, Reply):
                         self._replies.append(item)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -114,8 +115,9 @@ class _Run(Run):
         self.kept.add(taken.pose)
         # The frame is on the disk; keeping all of them would fill the memory.
         self.guide.keep(replace(taken, posed=None, row=self.kept.rows[-1]))
+        agrees = agreement(self.guide.taken, self.asked.spacing_mm)
         at = f"{taken.pixel[0]:.1f}, {taken.pixel[1]:.1f}"
-        self.person.say(f"{self.last_image()}: target at {at} px{self._estimate()}")
+        self.person.say(f"{self.last_image()}: target at {at} px{agrees}")
 
     def _check_spacing(self, now: tuple[float, float]) -> None:
         """Refuse an image of another depth: its pixels do not fit together with those before.
@@ -137,32 +139,36 @@ class _Run(Run):
         self.guide.taken.pop()
         self.guide.forget()
 
-    def _estimate(self) -> str:
-        """How well the images so far agree, and which one does not."""
-        taken = self.guide.taken
-        if len(taken) < _LEAST_FOR_ESTIMATE:
-            return ""
-        from jaxcal.calibration.calibrate import calibrate
 
-        images = make_images(
-            np.array([each.pose for each in taken]),
-            np.array([each.pixel for each in taken]),
-            "pixel",
-            spacing_mm=self.asked.spacing_mm,
-        )
-        scale = () if self.asked.spacing_mm is not None else ("scale",)
-        try:
-            answer = calibrate(Recording(images), "conventional", estimate=scale)
-        except CalibrationError as error:
-            return f"; no estimate yet ({error})"
-        residual = np.linalg.norm(np.asarray(answer.residual), axis=-1)
-        text = f"; the images agree to {float(answer.rms):.2f} mm"
-        worst = int(np.argmax(residual))
-        if residual[worst] > max(_STANDS_OUT * float(np.median(residual)), _LEAST_MM):
-            text += f"; image {taken[worst].row} stands out by {residual[worst]:.1f} mm"
-            if worst == len(taken) - 1:
-                text += " (u removes it)"
-        return text
+def agreement(taken: Sequence[Taken], spacing_mm: tuple[float, float] | None) -> str:
+    """How well the images so far agree by the conventional fit, and which one does not.
+
+    Args:
+        taken: the images, the last one last.
+        spacing_mm: sizes of a pixel; None: they are estimated as well.
+
+    Returns:
+        Words that go on with a line; empty for fewer than six images.
+    """
+    if len(taken) < _LEAST_FOR_ESTIMATE:
+        return ""
+    from jaxcal.calibration.calibrate import calibrate
+
+    poses, pixels = (np.array([getattr(each, of) for each in taken]) for of in ("pose", "pixel"))
+    images = make_images(poses, pixels, "pixel", spacing_mm=spacing_mm)
+    scale = () if spacing_mm is not None else ("scale",)
+    try:
+        answer = calibrate(Recording(images), "conventional", estimate=scale)
+    except CalibrationError as error:
+        return f"; no estimate yet ({error})"
+    residual = np.linalg.norm(np.asarray(answer.residual), axis=-1)
+    text = f"; the images agree to {float(answer.rms):.2f} mm"
+    worst = int(np.argmax(residual))
+    if residual[worst] > max(_STANDS_OUT * float(np.median(residual)), _LEAST_MM):
+        text += f"; image {taken[worst].row} stands out by {residual[worst]:.1f} mm"
+        if worst == len(taken) - 1:
+            text += " (u removes it)"
+    return text
 
 
 def _found(posed: PosedImages) -> list[str]:

@@ -24,6 +24,7 @@ import numpy as np
 from hw.recording.file import utc_now
 from hw.recording.layout import TEXT_BYTES, RecordingHeader
 from hw.runtime.clock import REAL, Waiting
+from hw.runtime.interrupts import lock_and_condition
 from hw.runtime.processes import finish, spawn
 from hw.runtime.rigid import ur_to_pose
 from jaxcal import CalibrationError, FormatError, OutputError
@@ -79,7 +80,7 @@ class Recorder:
         self._waiting = 0
         self._taken = 0
         """How often the writer has taken or told something."""
-        self._changed = threading.Condition()
+        self._lock, self._changed = lock_and_condition()
         self._answers: dict[str, Any] = {}
         self.error: CalibrationError | None = None
         """The first error of the writer; None as long as it writes."""
@@ -362,7 +363,7 @@ class Recorder:
         def room() -> bool:
             return not self._waiting or self._waiting + size <= self._capacity
 
-        with self._changed:
+        with self._lock:
             if not wait and not room():
                 self._raise_error()
                 return False
@@ -375,7 +376,7 @@ class Recorder:
 
     def _answer(self, mark: str, patience_s: float | None = None) -> Any:
         patience = self._patience if patience_s is None else patience_s
-        with self._changed:
+        with self._lock:
             self._wait_for(lambda: mark in self._answers, patience)
             return self._answers.pop(mark)
 
@@ -417,7 +418,7 @@ class Recorder:
 
     def _stop(self) -> None:
         """Let the queue run empty, close the pipe, and wait for the writer's end."""
-        with self._changed:
+        with self._lock:
             self._ending = self._ended = True
             self._changed.notify_all()
         ending_s = _HUNG_ENDING_S if self._hung else _ENDING_S
@@ -445,7 +446,7 @@ class Recorder:
     def _feed(self, pipe: BinaryIO) -> None:
         try:
             while True:
-                with self._changed:
+                with self._lock:
                     while not self._queue:
                         if self._ending:
                             return
@@ -453,13 +454,13 @@ class Recorder:
                     data = self._queue.popleft()
                 pipe.write(data)
                 pipe.flush()
-                with self._changed:
+                with self._lock:
                     self._waiting -= len(data)
                     self._taken += 1
                     self._changed.notify_all()
         except OSError:
             # The writer is gone; the listener knows why.
-            with self._changed:
+            with self._lock:
                 self._queue.clear()
         finally:
             with suppress(OSError):
@@ -475,7 +476,7 @@ class Recorder:
                 kind = FormatError if answer["format"] else OutputError
                 self._fail(kind(answer["error"]))
                 continue
-            with self._changed:
+            with self._lock:
                 self._taken += 1
                 if "mark" in answer:
                     self._answers[answer["mark"]] = answer
@@ -484,7 +485,7 @@ class Recorder:
             self._fail(OutputError(f"{self.path}: the writer ended; resume the recording"))
 
     def _fail(self, error: CalibrationError) -> None:
-        with self._changed:
+        with self._lock:
             # Keep the first error: the later ones follow from it.
             self.error = self.error or error
             self._changed.notify_all()

@@ -26,6 +26,7 @@ from hw.recording.recorder import Recorder
 from hw.robot.stream import PoseSample, PoseStream
 from hw.runtime.clock import Waiting
 from hw.runtime.errors import DeviceError, StaleError
+from hw.runtime.interrupts import lock_and_condition
 from hw.runtime.rigid import apart
 from hw.setup.description import Setup
 from hw.ultrasound.receiver import Image, UltrasoundStatistics, UltrasoundStream
@@ -103,7 +104,7 @@ class Session:
         self.setup, self.clock = setup, setup.clock
         self.watch = Watch() if watch is None else watch
         self._recorder, self._every_frame = recorder, every_frame
-        self._changed = threading.Condition()
+        self._lock, self._changed = lock_and_condition()
         self._echo_frames: deque[EchoFrame] = deque(maxlen=_KEPT_FRAMES)
         self._image: Image | None = None
         self._first_seen: dict[int, float] = {}
@@ -227,7 +228,7 @@ class Session:
     def _trouble(self) -> Exception | None:
         if self._recorder.error is not None:
             return self._recorder.error
-        with self._changed:
+        with self._lock:
             if self._failure is not None:
                 return self._failure
             held_up = self._held_up_s()
@@ -302,7 +303,7 @@ class Session:
                 raise DeviceError(text, device="active echo")
         found: list[EchoFrame] = []
         waiting = Waiting(self.clock)
-        with self._changed:
+        with self._lock:
             while True:
                 period = frame_period(list(self._echo_frames), self._clock_hz)
                 if period is not None:
@@ -326,7 +327,7 @@ class Session:
 
     def latest_image(self) -> Image | None:
         """The newest ultrasound frame, or None before the first."""
-        with self._changed:
+        with self._lock:
             return self._image
 
     def image_after(self, since: float) -> Image:
@@ -338,7 +339,7 @@ class Session:
         grace = self.watch.grace_s
         longest = max(self.clock.patience(grace), since - self.clock.now() + grace)
         waiting = Waiting(self.clock)
-        with self._changed:
+        with self._lock:
             while True:
                 image = self._image
                 if image is not None and image.prompt_s > since and image.array.dtype == np.uint8:
@@ -356,7 +357,7 @@ class Session:
 
     def is_of_the_way(self, image: Image) -> bool:
         """Whether the same image, to the last pixel, came before the arm came to rest."""
-        with self._changed:
+        with self._lock:
             first = self._first_seen.get(zlib.crc32(image.array.tobytes()), image.t_host)
             return first <= self._moved_s
 
@@ -375,7 +376,7 @@ class Session:
                     break
                 time.sleep(_PERIOD_WALL_S)
         except Exception as error:
-            with self._changed:
+            with self._lock:
                 self._failure = error
                 self._changed.notify_all()
         # Data from before a device was lost belong into the file too.
@@ -387,7 +388,7 @@ class Session:
         images = [] if self.images is None else self._of_one_device(self.images.drain())
         poses = self.poses.drain()
         now, counts = self.clock.now(), self.echo.statistics()
-        with self._changed:
+        with self._lock:
             for what, text in _BAD_FRAMES.items():
                 more = getattr(counts, what) - getattr(self._counts, what)
                 self._bad.extend((now, text) for _ in range(min(more, 16)))

@@ -45,6 +45,9 @@ FURTHEST_TIP_MM = 500.0
 FORCE_WITHOUT_REASON_N = 140.0
 """For contact with a person's chest and abdomen the quasi-static limits of ISO/TS 15066 are no
 higher than this; a higher cap needs ``force_reason``."""
+CALLER_S = 0.12
+"""How long the process that asks for motions may be silent in one (bench s): with the time to
+notice it and to slow down the robot rests within 0.2 s."""
 _MOST_CORNERS = 64
 
 Vector3 = tuple[float, float, float]

@@ -36,6 +36,7 @@ from collections.abc import Callable
 import numpy as np
 
 from hw.robot.confirmation import Confirmation
+from hw.robot.limits import CALLER_S
 from hw.robot.motion_plan import MotionPlan
 from hw.robot.mover.messages import WATCHDOG, Setup, error_of, line_of, sample_of, told
 from hw.robot.path_checks import check_plan
@@ -87,7 +88,7 @@ class Motion:
         dry_run: bool = True,
         log: Log | None = None,
         guard: Guard | None = None,
-        caller_s: float = 0.15,
+        caller_s: float = CALLER_S,
     ) -> None:
         self.host, self.plan, self.clock, self.dry_run = host, plan, clock, dry_run
         self.guard = guard

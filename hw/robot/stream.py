@@ -25,6 +25,7 @@ from hw.robot.identity import Identity, read_identity
 from hw.robot.rtde import Packet, PendantSettings, too_late
 from hw.runtime.clock import REAL, Clock, Lag, Waiting
 from hw.runtime.errors import DeviceError, LostError, StaleError, refused
+from hw.runtime.interrupts import lock_and_condition
 from hw.runtime.processes import spawn
 from hw.runtime.rigid import mean_pose, pose_to_ur, ur_to_pose
 from jaxcal.runtime.array_types import Float
@@ -134,7 +135,7 @@ class PoseStream:
         self._error: str | None = None
         self._changed: str | None = None
         self._lag = Lag()
-        self._condition = threading.Condition()
+        self._lock, self._condition = lock_and_condition()
         self._process: subprocess.Popen[bytes] | None = None
         self._thread: threading.Thread | None = None
 
@@ -157,7 +158,7 @@ class PoseStream:
         self._thread.start()
         # Starting an interpreter takes seconds on a busy machine; that is not the robot's fault.
         patience = self._timeout + 20.0
-        with self._condition:
+        with self._lock:
             come = self._condition.wait_for(lambda: self._latest or self._error, patience)
         if not come or self._error:
             self.close()
@@ -187,7 +188,7 @@ class PoseStream:
             StaleError: it is older than ``max_age_s``.
             RefusedError: the controller's TCP offset changed since the start.
         """
-        with self._condition:
+        with self._lock:
             sample, error = self._latest, self._error
         self._check(error)
         if sample is None:
@@ -201,9 +202,33 @@ class PoseStream:
             )
         return sample
 
+    def awaited(self, patience_s: float = 3.0) -> PoseSample:
+        """The newest pose of a robot at rest: one that is too old is no reason to give up yet.
+
+        A busy machine holds a process up for a tenth of a second now and then. That stops a motion;
+        where nothing moves, the next pose is waited for.
+
+        Args:
+            patience_s: longest wait.
+
+        Raises:
+            LostError: the connection is gone.
+            StaleError: no fresh pose came in time.
+            RefusedError: the controller's TCP offset changed since the start.
+        """
+        waiting = Waiting(self.clock)
+        while True:
+            try:
+                return self.latest()
+            except StaleError:
+                if waiting.so_far() > self.clock.patience(patience_s):
+                    raise
+            with self._lock:
+                self._condition.wait(_TURN_WALL_S)
+
     def drain(self) -> list[PoseSample]:
         """Every pose since the last drain, in order; also after the connection was lost."""
-        with self._condition:
+        with self._lock:
             samples = list(self._samples)
             self._samples.clear()
         return samples
@@ -219,7 +244,7 @@ class PoseStream:
         come: list[PoseSample] = []
         longest = seconds + self.clock.speed * (1.0 + self.max_age_s)
         waiting = Waiting(self.clock)
-        with self._condition:
+        with self._lock:
             self._listeners.append(come)
             while not come or come[-1].t_host < start + seconds:
                 if self._error or waiting.so_far() > longest:
@@ -265,7 +290,7 @@ class PoseStream:
         except (EOFError, OSError, pickle.UnpicklingError):
             pass
         finally:
-            with self._condition:
+            with self._lock:
                 self._error = error
                 self._condition.notify_all()
 
@@ -284,7 +309,7 @@ class PoseStream:
                 self._compare(packet.tcp_offset)
         if not new:
             return
-        with self._condition:
+        with self._lock:
             room = (self._samples.maxlen or 0) - len(self._samples)
             self.dropped += max(0, len(new) - room)
             self._samples.extend(new)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from types import FrameType
 from typing import NoReturn
 
@@ -63,3 +63,14 @@ def heed_interrupt() -> None:
     """
     if _asked:
         raise KeyboardInterrupt
+
+
+def lock_and_condition() -> tuple[AbstractContextManager[bool], threading.Condition]:
+    """A lock of data that threads share, and a condition on it by which they wait for changes.
+
+    The lock is what to enter: ``with lock``. A condition is entered by a function in Python, and a
+    KeyboardInterrupt that comes there just after the lock was taken leaves it taken for ever. The
+    other thread then waits for it, and whoever waits for the end of that thread does not end.
+    """
+    lock = threading.RLock()
+    return lock, threading.Condition(lock)

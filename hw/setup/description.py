@@ -18,7 +18,7 @@ from hw.midplane.search import Settings
 from hw.planning.poses import Extent
 from hw.planning.scene import Scene
 from hw.robot.kinematics import model_named
-from hw.robot.limits import FURTHEST_TIP_MM, Limits, hull_of, numbers
+from hw.robot.limits import CALLER_S, FURTHEST_TIP_MM, Limits, hull_of, numbers
 from hw.runtime.clock import REAL, Clock
 from hw.runtime.errors import RefusedError, refused
 from hw.runtime.hosts import check_host
@@ -85,7 +85,7 @@ class Setup:
     frequency_hz: float | None = None
     tcp_offset: tuple[float, ...] | None = None
     settle_s: float = 0.3
-    caller_s: float = 0.15
+    caller_s: float = CALLER_S
     frames: int = 9
     model: str | None = None
     housing_mm: tuple[float, float, float] | None = None

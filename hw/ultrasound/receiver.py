@@ -17,6 +17,7 @@ import numpy as np
 
 from hw.runtime.clock import REAL, Clock, Lag
 from hw.runtime.errors import Device, DeviceError, LostError, StaleError
+from hw.runtime.interrupts import lock_and_condition
 from hw.ultrasound.framing import MessageDecoder
 from jaxcal.data.poses import ROTATION_TOLERANCE, nearest_rotations
 from jaxcal.io.given_files import one_line
@@ -142,7 +143,7 @@ class UltrasoundStream:
         self.host, self.port = host, port
         self._clock, self._capacity, self._device = clock, queue, device
         self._decoder = MessageDecoder()
-        self._changed = threading.Condition()
+        self._lock, self._changed = lock_and_condition()
         self._images: deque[Image] = deque()
         self._transforms: deque[Transform] = deque(maxlen=4096)
         self._counts = UltrasoundStatistics()
@@ -202,7 +203,7 @@ class UltrasoundStream:
             StaleError: no new image in time.
             LostError: the connection is gone; images that came before are handed out first.
         """
-        with self._changed:
+        with self._lock:
             self._changed.wait_for(
                 lambda: self._images or self._failure, self._clock.wall(timeout_s)
             )
@@ -221,7 +222,7 @@ class UltrasoundStream:
         Raises:
             LostError: the connection is gone and no image waits.
         """
-        with self._changed:
+        with self._lock:
             images = list(self._images)
             self._images.clear()
             if not images and self._failure is not None:
@@ -230,14 +231,14 @@ class UltrasoundStream:
 
     def transforms(self) -> list[Transform]:
         """All transforms since the last call, oldest first; may be none."""
-        with self._changed:
+        with self._lock:
             transforms = list(self._transforms)
             self._transforms.clear()
         return transforms
 
     def statistics(self) -> UltrasoundStatistics:
         """Counts since the connection was made."""
-        with self._changed:
+        with self._lock:
             decoder = self._decoder
             return replace(
                 self._counts,
@@ -261,7 +262,7 @@ class UltrasoundStream:
             except OSError:
                 count = 0
             if not count:
-                with self._changed:
+                with self._lock:
                     self._failure = LostError(
                         f"{self.address} has closed the connection", device=DEVICE
                     )
@@ -271,7 +272,7 @@ class UltrasoundStream:
             messages = self._decoder.feed(chunk[:count], now)
             if not messages:
                 continue
-            with self._changed:
+            with self._lock:
                 for message in messages:
                     self._take(message)
                 self._changed.notify_all()

@@ -30,10 +30,10 @@ from jaxcal.diagnostics.uncertainty import (
     LARGEST_SD,
     covariance_by_axis,
     mm_at_target,
-    rests_on_bound,
     threshold,
     variances_by_axis,
 )
+from jaxcal.model.arc import OnArc
 from jaxcal.model.batch import ImagePlanes, Iterate, barrier, targets
 from jaxcal.model.observations import (
     BoundedOffsets,
@@ -42,9 +42,10 @@ from jaxcal.model.observations import (
     LocalUnknown,
     local_unknowns,
 )
-from jaxcal.model.thresholds import LARGEST_ELEVATION, MINIMUM_SELF_TUNING, STATIONARY
+from jaxcal.model.thresholds import MINIMUM_SELF_TUNING, STATIONARY
 from jaxcal.model.unknowns import Blocks, count_unknowns, split_further
 from jaxcal.result.calibration import Calibration, Linearisation, Medium, Status
+from jaxcal.solvers.auto import Averaged
 from jaxcal.solvers.convergence import Convergence
 from jaxcal.solvers.dense import inverse_batch_last
 from jaxcal.solvers.methods import Solution
@@ -92,16 +93,15 @@ def assemble(
     errors = Errors.of(iterate, images)
     elevation = mask * errors.q[1]
     in_plane = errors.squares(errors.q[1], errors.distance)
-
-    variance, bounds = jnp.ones_like(used), None
+    bounds, tracker_sd = None, None
     if bound is not None and local is not None:
         elevation = mask * local
         bounds = ActiveBounds.of(errors, local, bound)
-        free = used - jnp.sum(bounds.resting, axis=-1)
-        variance = bounds.cost / jnp.maximum(3 * used - count_unknowns(blocks) - free, 1.0)
-    elif plan.prior == "none":
-        variance = in_plane / jnp.maximum(3 * used - count_unknowns(blocks), 1.0)
+    elif given.tracker_sd is not None and local is not None:
+        elevation = mask * (errors.q[1] + given.tracker_sd * local)
+        tracker_sd = jnp.broadcast_to(given.tracker_sd, used.shape)
 
+    variance = _residual_variance(used, in_plane, bounds, plan)
     lever = jax.lax.stop_gradient(errors.lever())
     inverse, observed = inverse_and_observability(
         information,
@@ -117,26 +117,8 @@ def assemble(
         inverse = covariance_by_axis(parts, variances, inverse)
         observable = jnp.logical_not(observed.degenerate | observed.weak)
         information = jnp.where(observable, inverse_batch_last(inverse)[0], information)
-    covariance, averaged = jnp.moveaxis(variance * inverse, -1, 0), found.averaged
-    if averaged is not None:
-        # What the Gaussian solution cannot determine at all stays unknown.
-        better = averaged.law.weighed[..., None, None] & jnp.isfinite(covariance)
-        covariance = jnp.where(better, jnp.moveaxis(averaged.covariance, -1, 0), covariance)
-    status = _status(iterate, convergence, observed, used)
-    # Three images are fitted exactly, so what the residuals tell of the errors is nearly zero.
-    known = (status != Status.UNOBSERVABLE) & (status != Status.FAILED)
-    covariance = jnp.where(known[..., None, None], covariance, jnp.nan)
-    if sigma is None:
-        three_sigmas = _residual_sds(errors, elevation, blocks, bounded=bound is not None)
-    elif plan.channels:
-        point_sd = sigma[..., :2] * _point_sd(errors, problem)
-        three_sigmas = jnp.concatenate([point_sd, sigma[..., 2:]], axis=-1)
-    else:
-        three_sigmas = sigma
-    tracker_sd = None
-    if given.tracker_sd is not None and local is not None:
-        elevation = mask * (errors.q[1] + given.tracker_sd * local)
-        tracker_sd = jnp.broadcast_to(given.tracker_sd, used.shape)
+    status, averaged = _status(iterate, convergence, observed, used), found.averaged
+    covariance = _covariance(jnp.moveaxis(variance * inverse, -1, 0), averaged, status)
     prior_sd = None
     if given.prior_sd is not None:
         prior_sd = jnp.broadcast_to(given.prior_sd, (*used.shape, *given.prior_sd.shape))
@@ -144,7 +126,7 @@ def assemble(
         image_to_probe=parameters.matrix(),
         point=parameters.point,
         elevation=elevation,
-        sigma=three_sigmas,
+        sigma=_error_sds(sigma, errors, elevation, problem, plan),
         offset_law=None if averaged is None else averaged.law,
         channel_sigma=None if sigma is None or not plan.channels else sigma[..., 0],
         unknowns_covariance=covariance,
@@ -194,6 +176,43 @@ def _normal_matrices(
     if geometry is observation:
         return weighted, weighted, None
     return weighted, accumulate(iterate, geometry, images, None).stacked(), None
+
+
+def _residual_variance(
+    used: Float[Array, "*batch"],
+    in_plane: Float[Array, "*batch"],
+    bounds: ActiveBounds | None,
+    plan: SolvePlan,
+) -> Float[Array, "*batch"]:
+    """Variance of the residuals of fits in mm, mm^2; 1 for residuals in SDs.
+
+    Args:
+        used: number of images in use.
+        in_plane: sum of squared errors from targets in the image plane, mm^2.
+        bounds: state of bounded offsets, if the method has them.
+        plan: of the solve.
+    """
+    known = count_unknowns(plan.blocks)
+    if bounds is not None:
+        free = used - jnp.sum(bounds.resting, axis=-1)
+        return bounds.cost / jnp.maximum(3 * used - known - free, 1.0)
+    if plan.prior == "none":
+        return in_plane / jnp.maximum(3 * used - known, 1.0)
+    return jnp.ones_like(used)
+
+
+def _covariance(
+    plain: Float[Array, "*batch p p"], averaged: Averaged | None, status: Int[Array, "*batch"]
+) -> Float[Array, "*batch p p"]:
+    """The covariance to report: the average's if laws were weighed, NaN where nothing is known."""
+    covariance = plain
+    if averaged is not None:
+        # What the Gaussian solution cannot determine at all stays unknown.
+        better = averaged.law.weighed[..., None, None] & jnp.isfinite(covariance)
+        covariance = jnp.where(better, jnp.moveaxis(averaged.covariance, -1, 0), covariance)
+    # Three images are fitted exactly, so what the residuals tell of the errors is nearly zero.
+    known = (status != Status.UNOBSERVABLE) & (status != Status.FAILED)
+    return jnp.where(known[..., None, None], covariance, jnp.nan)
 
 
 class Errors(eqx.Module):
@@ -253,19 +272,15 @@ class ActiveBounds(eqx.Module):
     @classmethod
     def of(cls, errors: Errors, y: Float[Array, "*batch n"], bound: Array) -> ActiveBounds:
         """The state at offsets y."""
-        distance, mask = errors.distance, errors.mask
-        axial = jnp.sqrt(jnp.maximum(distance**2 - y**2, (1e-6 * distance) ** 2))
-        slope = y / axial
-        elevational = errors.q[1] - y
-        cost = errors.squares(elevational, axial)
-        limit = jnp.minimum(bound, LARGEST_ELEVATION * jnp.abs(distance))
-        force = slope * (errors.q[2] - axial) - elevational
-        resting = mask * rests_on_bound(y, force, limit)
-        size = jnp.sqrt(1 + slope**2)
+        mask = errors.mask
+        arc = OnArc.at(y, errors.q[1:], errors.distance, bound)
+        cost = errors.squares(errors.q[1] - y, arc.axial)
+        resting = mask * arc.resting
+        size = jnp.sqrt(1 + arc.slope**2)
         typical = jnp.sqrt(cost / (3 * jnp.sum(mask, axis=-1)))
         typical = typical + jnp.finfo(typical.dtype).tiny
-        hold = jnp.where(resting > 0, jnp.abs(force) / size / typical[..., None], jnp.inf)
-        gap = jnp.where((resting > 0) | (mask == 0), jnp.inf, jnp.abs(limit - jnp.abs(y)))
+        hold = jnp.where(resting > 0, jnp.abs(arc.force) / size / typical[..., None], jnp.inf)
+        gap = jnp.where((resting > 0) | (mask == 0), jnp.inf, jnp.abs(arc.limit - jnp.abs(y)))
         return cls(resting, cost, jnp.min(gap, axis=-1), jnp.min(hold, axis=-1))
 
 
@@ -366,6 +381,23 @@ def _is_differentiable(
         good = good & (bounds.gap > LEAST_GAP_MM) & (bounds.hold > LEAST_HOLD)
         good = good & jnp.logical_not(observed.singular)
     return good & plan.options.differentiate
+
+
+def _error_sds(
+    sigma: Float[Array, "*batch components"] | None,
+    errors: Errors,
+    elevation: Float[Array, "*batch n"],
+    problem: Problem,
+    plan: SolvePlan,
+) -> Float[Array, "*batch 3"]:
+    """SDs of lateral position, range and offset, mm, from those of the solve if it had any."""
+    if sigma is None:
+        bounded = plan.prior == "bounded"
+        return _residual_sds(errors, elevation, plan.blocks, bounded=bounded)
+    if plan.channels:
+        point_sd = sigma[..., :2] * _point_sd(errors, problem)
+        return jnp.concatenate([point_sd, sigma[..., 2:]], axis=-1)
+    return sigma
 
 
 def _residual_sds(

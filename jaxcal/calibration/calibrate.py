@@ -159,17 +159,17 @@ def calibrate(
             differentiated that stops before the minimum.
     """
     request = Request(
-        method,
-        prior,
-        max_elevation,
-        sigma,
-        tracker_sd,
-        unknown_names(estimate),
-        data,
-        sound_speed_sd,
-        delay_sd,
-        options,
-        robust,
+        method=method,
+        prior=prior,
+        max_elevation=max_elevation,
+        sigma=sigma,
+        tracker_sd=tracker_sd,
+        estimate=unknown_names(estimate),
+        data=data,
+        sound_speed_sd=sound_speed_sd,
+        delay_sd=delay_sd,
+        options=options,
+        robust=robust,
     )
     # Not in own modes: segmenting times of flight imports JAX, whose modes are entered after that.
     recording = problem if isinstance(problem, Recording) else None
@@ -285,17 +285,17 @@ def calibrate_batch(
     if chunk is not None:
         chunk = whole_number("chunk", chunk, 1, LARGEST_CHUNK)
     request = Request(
-        method,
-        prior,
-        max_elevation,
-        sigma,
-        tracker_sd,
-        unknown_names(estimate),
-        data,
-        sound_speed_sd,
-        delay_sd,
-        options,
-        robust,
+        method=method,
+        prior=prior,
+        max_elevation=max_elevation,
+        sigma=sigma,
+        tracker_sd=tracker_sd,
+        estimate=unknown_names(estimate),
+        data=data,
+        sound_speed_sd=sound_speed_sd,
+        delay_sd=delay_sd,
+        options=options,
+        robust=robust,
     )
     problems, plan, given = prepare(problems, request, "jaxcal.calibrate_batch")
     from jaxcal.calibration.engine import solve_batch
@@ -376,14 +376,14 @@ def prepare(
     tuning = kind == "gaussian" and request.sigma is None
     laws = LAWS.get(request.prior, ()) if tuning else ()
     plan = SolvePlan(
-        request.method,
-        kind,
-        tuning,
-        laws,
-        channels,
-        blocks,
-        options,
-        bool(request.robust),
+        method=request.method,
+        prior=kind,
+        self_tuning=tuning,
+        laws=laws,
+        channels=channels,
+        blocks=blocks,
+        options=options,
+        robust=bool(request.robust),
     )
     return _with_bound(problem, array(request.max_elevation)), plan, given
 

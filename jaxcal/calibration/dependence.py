@@ -70,9 +70,8 @@ LEAST_STREAM_TIME = 4.0
 """Least autocorrelation time of a stream, in images."""
 
 KEPT_OF_TIME, KEPT_OF_STREAM = 2.5, 60
-"""With fewer images the errors of simulated streams are up to three times larger, and intervals do
-not hold more often; with ten in a correlation time, and hundreds in a stream, intervals are too
-short."""
+"""With fewer images errors are larger, and intervals do not hold more often; with all images of a
+stream intervals are too short (``experiments/stream_images.py``)."""
 STREAM_SCORE = 5.0
 """In a stream the correlation of successive errors is more than so many SDs above zero."""
 

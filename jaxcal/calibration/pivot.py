@@ -37,6 +37,7 @@ from jaxcal.model.residuals import target_in_image
 from jaxcal.model.thresholds import FEWEST_IMAGES
 from jaxcal.result.calibration import Status, check_one, status_names
 from jaxcal.runtime import compiler, executables
+from jaxcal.runtime.array_types import AnyArray
 from jaxcal.runtime.arrays import first_images, is_traced
 from jaxcal.runtime.given_values import check_flag, real_array, truth_array
 from jaxcal.runtime.jax_modes import in_own_modes, inside_transformation, require_float64
@@ -191,8 +192,8 @@ class Pivot(eqx.Module):
 
 @in_own_modes
 def calibrate_pivot(
-    poses: Float[np.ndarray | Array, "*batch n rows 4"],
-    mask: Float[np.ndarray | Array, "*batch n"] | Bool[np.ndarray, " n"] | None = None,
+    poses: Float[AnyArray, "*batch n rows 4"],
+    mask: Float[AnyArray, "*#batch n"] | Bool[AnyArray, "*#batch n"] | None = None,
     *,
     robust: bool = True,
 ) -> Pivot:

@@ -140,7 +140,7 @@ def _read(source: str, options: dict[str, Any]):
         read = images.measurements[used], images.poses[used], images.kind, which
         return *read, images.spacing_mm, frame
     from jaxcal.data.recording import MetresError, check_pose_units
-    from jaxcal.io.sources import SEQUENCES, kind_of
+    from jaxcal.io.importing.sources import SEQUENCES, kind_of
     from jaxcal.io.text import read_pose_table
 
     if kind_of(source) in SEQUENCES:

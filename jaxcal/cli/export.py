@@ -60,9 +60,18 @@ _FORMATS = tuple(
     metavar="HOST[:PORT]",
     help="Set the transform in a PlusServer that is running (port 18944 by default).",
 )
-@click.option("--image-frame", default="Image", show_default=True, metavar="FRAME")
 @click.option(
-    "--probe-frame", metavar="FRAME", help="[default: the recording's name of it, or Probe]"
+    "--image-frame",
+    default="Image",
+    show_default=True,
+    metavar="FRAME",
+    help="What the other program calls the image's frame.",
+)
+@click.option(
+    "--probe-frame",
+    metavar="FRAME",
+    help="What it calls the frame that is tracked on the probe.  [default: the recording's name of "
+    "it, or Probe]",
 )
 @click.option(
     "--pixel-size",

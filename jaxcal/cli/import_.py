@@ -53,8 +53,8 @@ def import_(sources: tuple[str, ...], out: str, add_to: str | None, **options: A
     _check(sources, out, add_to, options)
     from jaxcal.data.recording import MINIMUM_IMAGES, OF_SOME, joined, shared_images
     from jaxcal.io.hdf5 import load, save
-    from jaxcal.io.importing import import_files
-    from jaxcal.io.sources import ImportOptions
+    from jaxcal.io.importing.files import import_files
+    from jaxcal.io.importing.sources import ImportOptions
 
     first = None if add_to is None else load(add_to)
     with progress("importing"):

@@ -41,11 +41,11 @@ def pick(frames: str, picks: str | None, every: int, port: int, **options: Any) 
     default PICKS.csv is beside SOURCE and has its name.
     """
     from jaxcal.io.atomic import check_writable
-    from jaxcal.io.frame_poses import frames_to_show, open_sequence
+    from jaxcal.io.importing.frame_poses import frames_to_show, open_sequence
+    from jaxcal.io.importing.sources import ImportOptions
     from jaxcal.io.picker.frames import Frames
     from jaxcal.io.picker.picks import Picks
     from jaxcal.io.picker.server import Picker
-    from jaxcal.io.sources import ImportOptions
 
     asked = ImportOptions(**options)
     name = Path(os.path.abspath(frames)).name

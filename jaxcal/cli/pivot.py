@@ -44,9 +44,9 @@ def pivot(poses: str, no_robust: bool, as_json: bool, **options: Any) -> int:
     import_engine()
     from jaxcal.calibration.pivot import calibrate_pivot
     from jaxcal.data.recording import MetresError
-    from jaxcal.io.frame_poses import tool_poses
     from jaxcal.io.given_files import naming
-    from jaxcal.io.sources import ImportOptions
+    from jaxcal.io.importing.frame_poses import tool_poses
+    from jaxcal.io.importing.sources import ImportOptions
     from jaxcal.report.pivot import pivot_lines
 
     measured, notes = tool_poses(poses, ImportOptions(**options))

@@ -259,8 +259,8 @@ def _from_nothing(
         )
     bounds = design.Constraints(
         region=_region(design.Region.of_probe(transducer), depth, lateral),
-        cone_deg=40.0 if cone is None else cone,
-        turn_deg=90.0 if turn is None else turn,
+        cone_deg=design.Constraints.cone_deg if cone is None else cone,
+        turn_deg=design.Constraints.turn_deg if turn is None else turn,
     )
     noise = design.Noise.of_probe(transducer) if sigma is None else design.Noise.constant(sigma)
     return design.make_candidates(

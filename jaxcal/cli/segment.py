@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from jaxcal.data.probe import Probe
     from jaxcal.data.recording import Recording
     from jaxcal.data.segmentation.segment import Segmentation
-    from jaxcal.io.target_search import FrameResults
+    from jaxcal.io.importing.target_search import FrameResults
 
 
 @click.command(short_help="Find the target in times of flight or in images.")
@@ -162,9 +162,9 @@ def _segment_frames(source: str, out: str | None, as_json: bool, options: dict[s
     """A sequence's frames; what became of each is counted and said."""
     from jaxcal.io.atomic import check_writable
     from jaxcal.io.hdf5 import save
-    from jaxcal.io.importing import import_files
+    from jaxcal.io.importing.files import import_files
+    from jaxcal.io.importing.sources import ImportOptions
     from jaxcal.io.outputs import RECORDING, check_output, is_recording
-    from jaxcal.io.sources import ImportOptions
 
     target = _default_out(source) if out is None else out
     check_output(target, "a recording", is_recording, [source], endings=RECORDING)
@@ -189,7 +189,7 @@ def _segment_frames(source: str, out: str | None, as_json: bool, options: dict[s
 def _frames_record(
     target: str, recording: Recording, notes: list[str], found: FrameResults
 ) -> dict[str, Any]:
-    from jaxcal.io.target_search import FATES
+    from jaxcal.io.importing.target_search import FATES
 
     images = recording.calibration
     return {

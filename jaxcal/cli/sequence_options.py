@@ -15,7 +15,7 @@ from jaxcal.cli.common import POSITIVE, Verbatim
 from jaxcal.runtime.messages import command_line
 
 if TYPE_CHECKING:
-    from jaxcal.io.target_search import FrameResults
+    from jaxcal.io.importing.target_search import FrameResults
 
 Command = Callable[..., Any]
 

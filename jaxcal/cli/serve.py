@@ -15,7 +15,14 @@ from jaxcal.cli.common import POSITIVE, ExitCode
     show_default=True,
     help="Address to listen at. Any other than the default lets other machines connect.",
 )
-@click.option("--port", type=click.IntRange(0, 65535), default=18945, show_default=True)
+@click.option(
+    "--port",
+    type=click.IntRange(0, 65535),
+    default=18945,
+    show_default=True,
+    metavar="N",
+    help="Port to listen at; 0: any free one.",
+)
 @click.option(
     "--rate", type=POSITIVE, default=2.0, show_default=True, metavar="HZ", help="Messages a second."
 )

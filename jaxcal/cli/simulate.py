@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import click
 
 from jaxcal import InputError
@@ -61,7 +63,7 @@ def simulate(
     out: str,
     images: int,
     elevation: float,
-    elevation_distribution: str,
+    elevation_distribution: Literal["uniform", "normal"],
     noise: float,
     probe: str,
     raw: bool,
@@ -87,7 +89,7 @@ def simulate(
     protocol = Protocol(
         images=images,
         elevation_mm=elevation,
-        elevation_distribution="normal" if elevation_distribution == "normal" else "uniform",
+        elevation_distribution=elevation_distribution,
         noise_mm=noise,
         probe=PRESETS[probe],
         raw=raw,

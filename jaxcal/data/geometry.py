@@ -1,7 +1,6 @@
 """Rigid transforms in JAX: 4x4 matrices in millimetres whose rotations can be trusted.
 
-Matrices from elsewhere are checked and converted by :mod:`jaxcal.data.poses`, some of whose
-functions can be imported from here, too.
+Matrices from elsewhere are checked and converted by :mod:`jaxcal.data.poses`, in numpy.
 """
 
 from __future__ import annotations

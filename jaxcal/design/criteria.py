@@ -56,7 +56,7 @@ def tre_weight(points: Float[np.ndarray, "m 3"], model: Model) -> Float[np.ndarr
     """W of the mean squared TRE over image points.
 
     Args:
-        points: [lateral, 0, axial] mm, e.g. :meth:`Region.grid`.
+        points: [lateral, 0, axial] mm, e.g. :meth:`jaxcal.design.constraints.Region.grid`.
         model: X, target and SDs; p is the number of its unknowns.
 
     Raises:

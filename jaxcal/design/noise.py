@@ -162,7 +162,7 @@ class Noise:
             return cls.constant(np.full(3, np.sqrt(np.mean(sigma**2))), 1.0)
         # The relative error of a tuned SD is about 1 / sqrt(2 n).
         left = max(count - 3, 1)
-        tuned = bool(answer.sigma_tuned) and count >= 8
+        tuned = bool(answer.sigma_tuned)
         doubt = float(np.exp(1.0 / np.sqrt(2.0 * left))) if tuned else UNKNOWN_BY
         model = cls.constant(sigma, doubt)
         if count < FEWEST_TO_LEARN:

@@ -35,7 +35,7 @@ from jaxcal.design.information import (
 )
 from jaxcal.design.noise import SD_RANGE_MM, Noise, check_result
 from jaxcal.diagnostics.directions import direction_in_words
-from jaxcal.diagnostics.uncertainty import mm_at_target
+from jaxcal.diagnostics.uncertainty import mm_at_target, nearest_unknown
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Bool, Float
 from jaxcal.runtime.given_values import check_flag, check_made, real_array, whole_number
@@ -309,19 +309,12 @@ def check_candidates(candidates: Candidates) -> None:
     values, vectors = np.linalg.eigh(found)
     if values[0] > _SINGULAR * values[-1]:
         return
-    null = vectors[:, values <= _SINGULAR * values[-1]]
-    weakest = direction_in_words(_purest(null), model.blocks)
+    null = values <= _SINGULAR * values[-1]
+    weakest = direction_in_words(nearest_unknown(vectors[None], null[None])[0], model.blocks)
     raise InputError(
         f"images at all {len(candidates)} candidate poses would not determine {weakest}: "
-        f"{_missing(candidates, model, null / scale[:, None])}"
+        f"{_missing(candidates, model, vectors[:, null] / scale[:, None])}"
     )
-
-
-def _purest(null: Float[np.ndarray, "p j"]) -> Float[np.ndarray, " p"]:
-    """The unit vector of a null space that is nearest to a single unknown."""
-    projector = null @ null.T
-    column = projector[:, int(np.argmax(np.diagonal(projector)))]
-    return column / np.linalg.norm(column)
 
 
 def _missing(candidates: Candidates, model: Model, null: Float[np.ndarray, "p j"]) -> str:

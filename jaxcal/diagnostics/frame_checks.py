@@ -1,16 +1,16 @@
-"""Detect wrong frames or units: the data fit badly as given, and well once a slip is corrected.
+"""Detect wrong frames or units: the data fit badly as given, and well once a mistake is corrected.
 
 A calibration does not notice wrong conventions by itself: poses from tracker to probe, rotations by
 columns instead of rows, or one axis with the other sign all give a converged answer, with residuals
-of millimetres. So the conventional fit (Eq. 7) is repeated with each of the common slips corrected.
-The fit is in closed form with both scales free, so it needs no start, no JAX and only a few tenths
-of a millisecond. Where a corrected fit is far better, the slip is reported.
+of millimetres. So the conventional fit (Eq. 7) is repeated with each of the common mistakes
+corrected. The fit is in closed form with both scales free, so it needs no start, no JAX and only a
+few tenths of a millisecond. Where a corrected fit is far better, the mistake is reported.
 
 *Far better* means two things. Both fits have n images, p unknowns and errors of unknown size. With
 f the sum of squares as given and f' the corrected one, the likelihood ratio is
 (f / f')^((3 n - p) / 2). It must exceed ``ODDS``, so that chance is ruled out although some twenty
-slips are tried. And f must exceed ``FACTOR`` times f', so that imperfect but correct data are not
-reported. If the images fit badly, poses and points are also shifted by up to half the
+corrections are tried. And f must exceed ``FACTOR`` times f', so that imperfect but correct data are
+not reported. If the images fit badly, poses and points are also shifted by up to half the
 recording, as where they were stamped by two clocks; for these shifts f must exceed ``FARTHER``
 times f'.
 
@@ -44,7 +44,7 @@ from jaxcal.solvers.closed_form.reduced_objective import (
 from jaxcal.solvers.closed_form.single import descend, feasible, scalar_root
 
 ODDS = 1e6
-"""How many times more probable the data must be with a slip corrected."""
+"""How many times more probable the data must be with a mistake corrected."""
 
 FACTOR = 4.0
 """How many times smaller the corrected sum of squares must be: 2 times in root mean square."""
@@ -75,7 +75,7 @@ LARGE_PIXEL_MM = 1.5
 """The unit is in doubt where pixels are larger. Points in mm that are read as pixels have 1 mm."""
 
 SAME_SCALE = 1.25
-"""With a slip corrected, known scales must come out within this factor."""
+"""With a mistake corrected, known scales must come out within this factor."""
 
 FARTHER = 16.0
 """The same factor for lists that are several rows out of step: many shifts are tried, and in slow
@@ -118,7 +118,7 @@ def wrong_frames(problem: Problem, estimate: tuple[str, ...] = ()) -> str | None
         return None
     before = fit.squares
     apart, extent = _typical_error(given, fit)
-    corrected = [(words, replace(given, **changed), FACTOR) for words, changed in _slips(given)]
+    corrected = [(words, replace(given, **changed), FACTOR) for words, changed in _mistakes(given)]
     best, told, least = before, None, FACTOR
     for words, data, factor in chain(corrected, _steps(images, farther=apart > UNFIT_MM / 2)):
         other = _free_fit(data)
@@ -133,7 +133,7 @@ def wrong_frames(problem: Problem, estimate: tuple[str, ...] = ()) -> str | None
         told = _wrong_scale(given, fit)
         if told is not None:
             return told
-    if 3 * count > 2 * UNKNOWNS and apart > max(UNFIT_MM, UNFIT * extent):
+    if _is_overdetermined(count) and apart > max(UNFIT_MM, UNFIT * extent):
         return (
             f"the images do not fit together (typical error {apart:.2g} mm, of a target that moves "
             f"by {extent:.2g} mm in them): do poses and points belong together, with times of one "
@@ -146,7 +146,7 @@ def wrong_frames(problem: Problem, estimate: tuple[str, ...] = ()) -> str | None
             f"the pixels come out as {_sizes(size)}: are the poses' translations in mm? (jaxcal "
             "import --pose-units states another unit)"
         )
-    if known and "scale" in estimate and _another_unit(fit.scales) and 3 * count > 2 * UNKNOWNS:
+    if known and "scale" in estimate and _another_unit(fit.scales) and _is_overdetermined(count):
         return (
             f"the pixels come out as {_sizes(size)}, but were said to have {_sizes(given.spacing)}:"
             " are the poses' translations in mm? (else correct the spacing, or leave it out)"
@@ -169,7 +169,7 @@ def doubtful_unit(problem: Problem) -> str | None:
         return None
     given = _out_of_step(replace(images, face_offset=0.0), 0)
     count = len(given.points)
-    fit = _free_fit(given) if 3 * count > 2 * UNKNOWNS else None
+    fit = _free_fit(given) if _is_overdetermined(count) else None
     if fit is None:
         return None
     size = fit.scales * given.spacing
@@ -203,6 +203,14 @@ def doubtful_unit(problem: Problem) -> str | None:
         f"and the errors within the image as {error:.2g} mm, which few probes and trackers reach; "
         f"{state}"
     )
+
+
+def _is_overdetermined(count: int) -> bool:
+    """Whether so many images give more than twice as many equations as there are unknowns.
+
+    Fewer are fitted so closely that the fit says little about them.
+    """
+    return 3 * count > 2 * UNKNOWNS
 
 
 def _another_unit(scales: Float[np.ndarray, " 2"]) -> bool:
@@ -258,15 +266,15 @@ def _far_better(before: float, after: float, count: int, factor: float = FACTOR)
 
 
 def _credible(scales: Float[np.ndarray, " 2"], images: ImageData, known: bool) -> bool:
-    """Whether a slip's scales could be those of the image."""
+    """Whether the scales of a corrected fit could be those of the image."""
     if known:
         return bool((np.abs(np.log(scales)) < np.log(SAME_SCALE)).all())
     size = scales * images.spacing
     return bool((size > PIXELS_MM[0]).all() and (size < PIXELS_MM[1]).all())
 
 
-def _slips(data: ImageData) -> Iterator[tuple[str, dict[str, np.ndarray]]]:
-    """The common slips: words, and the fields of the data that are corrected."""
+def _mistakes(data: ImageData) -> Iterator[tuple[str, dict[str, np.ndarray]]]:
+    """The common mistakes: words, and the fields of the data that are corrected."""
     rotations, shifts = data.rotations, data.translations
     turned = np.swapaxes(rotations, 1, 2)
     back = -np.einsum("nij,nj->ni", turned, shifts)

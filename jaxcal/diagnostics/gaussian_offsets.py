@@ -109,11 +109,11 @@ def shortened(
 
 
 def tuned(
-    errors: Float[Array, "m 3"], rows: Float[Array, "m 3 q"], images: int
-) -> tuple[Float[Array, " 3"], Float[Array, " q"]]:
+    errors: Float[Array, "m kinds"], rows: Float[Array, "m kinds q"], images: int
+) -> tuple[Float[Array, " kinds"], Float[Array, " q"]]:
     """Mean squared errors of each kind after the fit with tuned SDs, and the step."""
     scale = 1 / np.sqrt(np.maximum(np.sum(rows**2, axis=(0, 1)), 1e-300))
-    variance = np.ones(3)
+    variance = np.ones(errors.shape[1])
     step = np.zeros(rows.shape[-1])
     for _ in range(_ROUNDS):
         weight = 1 / np.sqrt(variance)[:, None]

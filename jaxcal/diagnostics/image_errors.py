@@ -21,6 +21,7 @@ import numpy as np
 from jaxcal.data.poses import rotations_from_vectors
 from jaxcal.data.problem import Problem
 from jaxcal.model import unknowns as model
+from jaxcal.model.arc import axial_on_circle
 from jaxcal.model.unknowns import (
     RIGID_UNKNOWNS,
     TINY,
@@ -211,7 +212,7 @@ class ImageErrors:
         self, elevation: Float[Array, "k n"]
     ) -> tuple[Float[Array, "k n 3"], Float[Array, "k n"]]:
         """The residual q - p(y) of Eq. 5, mm (0 where left out), and p's axial coordinate."""
-        axial = np.sqrt(np.maximum(self.distance**2 - elevation**2, (1e-6 * self.distance) ** 2))
+        axial = axial_on_circle(self.distance, elevation)
         residual = self.q - np.stack([self.lateral, elevation, axial], axis=-1)
         return self.mask[..., None] * residual, axial
 

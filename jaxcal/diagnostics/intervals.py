@@ -266,7 +266,7 @@ def tre_at(calibration: Calibration, points: Float[np.ndarray, "*points 2"]) -> 
 
 
 def tre_over(calibration: Calibration, points: Float[np.ndarray, "m 2"]) -> TargetError:
-    """Root mean square over image points of the error of one calibration, with its interval.
+    """Root mean square over image points of a calibration's error, with its interval.
 
     It is sqrt(mean of |J_p d|^2 over the points p), the single number with which two calibrations
     are compared over the image. Its interval is that of this number.

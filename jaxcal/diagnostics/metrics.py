@@ -1,4 +1,4 @@
-"""How good a calibration is: reconstruction precision, reproducibility, residual RMS."""
+"""How good a calibration is: reconstruction precision and reproducibility."""
 
 from __future__ import annotations
 

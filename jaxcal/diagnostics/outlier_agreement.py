@@ -19,7 +19,7 @@ from jaxcal.model.image_points import distance
 from jaxcal.model.unknowns import RIGID
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Float
-from jaxcal.solvers.closed_form.single import ClosedForm, solve_problem
+from jaxcal.solvers.closed_form.single import ClosedForm, in_closed_form, solve_problem
 
 FEWEST_LEFT_OUT = 8
 """With fewer images left out there is no second group."""
@@ -55,7 +55,7 @@ def agreeing_outliers(
     left = (np.asarray(problem.mask) > 0) & ~kept
     if left.sum() < max(FEWEST_LEFT_OUT, LEAST_SHARE * kept.sum()):
         return None
-    estimate = ("scale",) if "scale" in answer.blocks else ()
+    estimate = in_closed_form(answer.blocks)
     try:
         own, other = (
             solve_problem(replace(problem, mask=mask.astype(float)), estimate)

@@ -13,9 +13,8 @@ from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import AnyArray
 from jaxcal.runtime.arrays import finite_or_none
 
-SUSPECTED = 0.02
-"""Half of this is the share of recordings with Gaussian errors in which chance alone makes an
-image suspect."""
+SUSPECTED = 0.01
+"""Share of recordings with Gaussian errors in which chance alone makes an image suspect."""
 
 
 class OutlierReason(TypedDict):
@@ -88,14 +87,15 @@ def suspects(result: Calibration) -> list[OutlierReason]:
     """Images in use that deviate by less than outliers do, but by more than chance explains.
 
     With Gaussian errors, the largest range error of all images (in SDs taken from medians, at the
-    target's place in the image) exceeds the limit in one recording of a hundred. Only range errors
-    count: offsets may have any law, so large ones are no sign of a wrong image.
+    target's place in the image) exceeds the limit in one recording of a hundred
+    (:data:`SUSPECTED`). Only range errors count: offsets may have any law, so large ones are no
+    sign of a wrong image.
     """
     count = int(result.images_used)
     if count < FEWEST_TO_CHECK:
         return []
     # The second factor corrects medians of few images; it is from simulated Gaussian errors.
-    limit = NormalDist().inv_cdf(1 - SUSPECTED / (4 * count)) * (1 + 8 / count)
+    limit = NormalDist().inv_cdf(1 - SUSPECTED / (2 * count)) * (1 + 8 / count)
     error = np.array(result.inspection.range_at_place, dtype=float)
     error[outliers(result)] = 0.0
     return [

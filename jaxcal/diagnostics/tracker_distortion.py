@@ -1,4 +1,4 @@
-"""Tracked positions that are distorted, smoothly over the places of the probe.
+"""Tracked poses that are off by what depends on the place or on the orientation of the probe.
 
 Metal near an electromagnetic tracker, or the edge of its range, moves the positions that it reports
 by nearly the same in neighbouring places. So errors of images are alike where their poses are, and
@@ -11,6 +11,15 @@ the SD of all of them), and coefficients theta_j in R^3 of one common variance. 
 the target only.) Orientations that are off in the same way move the target by smooth vectors as
 well, and are found with it.
 
+Markers that are wrong, or partly hidden, from some sides give poses that are off by what
+depends on the orientation of the probe. Then the image moves on the probe, within its plane, by
+
+    g(a) = sum_k a_k theta_k,    theta_k ~ N(0, s^2 I),
+
+with a the rotation vector from the mean orientation, in the probe's frame, divided by the SD of all
+of them, and theta_k the motion along and about the image's axes (a rotation in mm at the points'
+root mean square distance from the image's origin).
+
 With e the whitened errors, J their derivatives by the unknowns and K those by theta, e + J d + K
 theta has the SDs of the three kinds of errors and s as parameters. The restricted likelihood is
 maximised by expectation maximisation, and compared with that of s = 0. The answer's unknowns follow
@@ -22,9 +31,11 @@ References: Harville 1977 (restricted likelihood); Laird and Ware 1982 (expectat
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
+from jaxcal.data.poses import nearest_rotations, quaternions_from_rotations
 from jaxcal.diagnostics.image_errors import ImageErrors
 from jaxcal.model.unknowns import block_slice
 from jaxcal.runtime.array_types import Bool, Float
@@ -33,12 +44,15 @@ Array = np.ndarray
 
 _QUADRATIC = 0.5
 """Size of the quadratic polynomials relative to the linear ones, since the field is smooth."""
-COEFFICIENTS = 27
-"""Number of components of all theta_j: of three linear and six quadratic polynomials."""
+WITHIN = (0, 2, 4)
+"""Parameters of X that move the image within its plane: laterally, axially, and about y."""
 _NEIGHBOURHOODS, _SHARE = 8, 0.1
 """Number of neighbourhoods, and the share of the positions in each."""
 _ROUNDS = 40
 """Rounds of expectation maximisation; further ones raise the likelihood hardly."""
+_UNDETERMINED = 1e-6
+"""Information on unknowns of unit columns, for those that some kinds of errors do not determine:
+errors within the image plane say nothing of a motion of the image along its normal."""
 
 
 def polynomials(positions: Float[Array, "n 3"], used: Bool[Array, " n"]) -> Float[Array, "n 9"]:
@@ -59,18 +73,62 @@ def by_target(seen: ImageErrors) -> Float[Array, "n 3 3"]:
     return seen.rows[0][..., block_slice(seen.blocks, "point")] * [[1.0], [1.0], [0.0]]
 
 
-def columns(seen: ImageErrors, used: Bool[Array, " n"]) -> Float[Array, "n 3 k"]:
-    """Derivatives K of one recording's errors (mm) by the coefficients (mm)."""
-    positions = np.asarray(seen.problem.poses)[0, :, :3, 3]
-    # A position that is off moves the errors as a target does that is off the other way.
-    along = -polynomials(positions, used)[:, None, :, None] * by_target(seen)[:, :, None, :]
-    return along.reshape(*along.shape[:2], COEFFICIENTS)
+def orientations(poses: Float[Array, "n 4 4"], used: Bool[Array, " n"]) -> Float[Array, "n 3"]:
+    """Rotation vectors a from the mean orientation; zeros if all orientations are the same."""
+    turns = np.where(used[:, None, None], poses[:, :3, :3], np.eye(3))
+    mean, _ = nearest_rotations(turns[used].mean(axis=0)[None])
+    quaternions = quaternions_from_rotations(np.swapaxes(mean, 1, 2) @ turns)
+    vector, length = quaternions[:, :3], np.linalg.norm(quaternions[:, :3], axis=1)
+    angle = 2 * np.arctan2(length, quaternions[:, 3])
+    vectors = vector * (angle / np.maximum(length, 1e-300))[:, None]
+    vectors = vectors - vectors[used].mean(axis=0)
+    return vectors / max(np.sqrt(np.mean(vectors[used] ** 2)), 1e-300)
 
 
-def size(positions: Float[Array, "n 3"], used: Bool[Array, " n"], variance: float) -> float:
-    """Root mean square distortion at the positions, mm, for a variance s^2, mm^2."""
-    squares = np.sum(polynomials(positions, used)[used] ** 2, axis=1)
-    return float(np.sqrt(3 * variance * np.mean(squares)))
+class RandomField(NamedTuple):
+    """What the poses of one recording may be off by, as basis functions of the place.
+
+    Every basis function has three coefficients, of one common variance.
+
+    Attributes:
+        places: of the images: positions in mm, or rotation vectors.
+        basis: the basis functions at the images' places.
+        along: derivatives of the images' errors (mm) by the field's three components there (mm).
+    """
+
+    places: Float[Array, "n 3"]
+    basis: Float[Array, "n b"]
+    along: Float[Array, "n 3 3"]
+
+    @classmethod
+    def of_positions(cls, seen: ImageErrors, used: Bool[Array, " n"]) -> RandomField:
+        """The field f, by which positions are off."""
+        positions = np.asarray(seen.problem.poses)[0, :, :3, 3]
+        # A position that is off moves the errors as a target does that is off the other way.
+        return cls(positions, polynomials(positions, used), -by_target(seen))
+
+    @classmethod
+    def of_orientations(cls, seen: ImageErrors, used: Bool[Array, " n"]) -> RandomField:
+        """The field g, by which the image moves on the probe."""
+        vectors = orientations(np.asarray(seen.problem.poses)[0], used)
+        lever = float(seen.lever(seen.mask)[0])
+        within = seen.rows[0][..., WITHIN] * [[1.0], [1.0], [0.0]] / [1.0, 1.0, lever]
+        return cls(vectors, vectors, within)
+
+    def columns(self) -> Float[Array, "n 3 k"]:
+        """Derivatives K of the images' errors (mm) by the k = 3 b coefficients (mm)."""
+        by = self.basis[:, None, :, None] * self.along[:, :, None, :]
+        return by.reshape(*by.shape[:2], -1)
+
+    def size(self, used: Bool[Array, " n"], variance: float) -> float:
+        """Root mean square of the field at the places of the images in use, mm.
+
+        Args:
+            used: those images.
+            variance: s^2, mm^2.
+        """
+        squares = np.sum(self.basis[used] ** 2, axis=1)
+        return float(np.sqrt(3 * variance * np.mean(squares)))
 
 
 def neighbourhoods(positions: Float[Array, "n 3"]) -> list[Bool[Array, " n"]]:
@@ -89,62 +147,111 @@ def neighbourhoods(positions: Float[Array, "n 3"]) -> list[Bool[Array, " n"]]:
 
 @dataclass(frozen=True)
 class Distortion:
-    """A random distortion that explains errors best.
+    """The random field that explains errors best.
 
     Attributes:
         statistic: twice the logarithm of the likelihood ratio.
         variance: s^2, mm^2.
         response: R, by which the answer's unknowns follow the coefficients, per mm.
+        kinds: variances of the kinds of errors beside it.
     """
 
     statistic: float
     variance: float
     response: Float[Array, "p k"]
+    kinds: Float[Array, " kinds"]
 
 
 def fit(
-    errors: Float[Array, "n 3"], rows: Float[Array, "n 3 q"], start: float
+    errors: Float[Array, "n 3"],
+    rows: Float[Array, "n 3 q"],
+    start: float,
+    coefficients: int,
 ) -> Distortion | None:
-    """The distortion that explains the errors best.
+    """The random field that explains the errors best.
 
     Args:
         errors: e, of the images that count.
         rows: J and, as the last columns, K.
         start: a first s^2, mm^2.
+        coefficients: the number of columns of K.
 
     Returns:
         None if the errors do not determine the unknowns.
     """
-    unknowns = rows.shape[-1] - COEFFICIENTS
+    unknowns = rows.shape[-1] - coefficients
+    squares, scale = _squares(errors, rows, unknowns)
+    try:
+        statistic, variance, kinds = _compared(squares, unknowns, len(errors), start)
+        fixed = squares.sum(axis=0)[:unknowns]
+        response = -np.linalg.solve(fixed[:, :unknowns], fixed[:, unknowns + 1 :])
+    except np.linalg.LinAlgError:
+        return None
+    return Distortion(statistic, variance, scale[:, None] * response, kinds)
+
+
+def statistic(
+    errors: Float[Array, "n kinds"],
+    rows: Float[Array, "n kinds q"],
+    start: float,
+    coefficients: int,
+) -> float:
+    """Twice the logarithm of the likelihood ratio alone, also of some kinds of errors only.
+
+    Args:
+        errors: e, of the images that count.
+        rows: J and, as the last columns, K.
+        start: a first s^2, mm^2.
+        coefficients: the number of columns of K.
+
+    Returns:
+        -inf where the likelihood has no maximum.
+    """
+    unknowns = rows.shape[-1] - coefficients
+    squares, _ = _squares(errors, rows, unknowns)
+    try:
+        return _compared(squares, unknowns, len(errors), start)[0]
+    except np.linalg.LinAlgError:
+        return -np.inf
+
+
+def _squares(
+    errors: Float[Array, "n kinds"], rows: Float[Array, "n kinds q"], unknowns: int
+) -> tuple[Float[Array, "kinds c c"], Float[Array, " p"]]:
+    """Of each kind, the products of the columns: unknowns, errors, coefficients.
+
+    The unknowns' columns have unit length; with the factors by which they are multiplied.
+    """
     scale = 1 / np.sqrt(np.maximum(np.sum(rows[..., :unknowns] ** 2, axis=(0, 1)), 1e-300))
     parts = [rows[..., :unknowns] * scale, errors[..., None], rows[..., unknowns:]]
     whole = np.swapaxes(np.concatenate(parts, axis=-1), 0, 1)
-    squares = np.swapaxes(whole, 1, 2) @ whole
+    return np.swapaxes(whole, 1, 2) @ whole, scale
+
+
+def _compared(
+    squares: Float[Array, "kinds c c"], unknowns: int, images: int, start: float
+) -> tuple[float, float, Float[Array, " kinds"]]:
+    """Twice the logarithm of the likelihood ratio, s^2, and the variances of the kinds."""
     alone = unknowns + 1
-    try:
-        plain, _ = _maximised(squares[:, :alone, :alone], unknowns, len(errors), start)
-        distorted, variance = _maximised(squares, unknowns, len(errors), start)
-        fixed = squares.sum(axis=0)[:unknowns]
-        response = -np.linalg.solve(fixed[:, :unknowns], fixed[:, alone:])
-    except np.linalg.LinAlgError:
-        return None
-    return Distortion(plain - distorted, variance, scale[:, None] * response)
+    plain, *_ = _maximised(squares[:, :alone, :alone], unknowns, images, start)
+    distorted, variance, kinds = _maximised(squares, unknowns, images, start)
+    return plain - distorted, variance, kinds
 
 
 def _maximised(
-    squares: Float[Array, "3 c c"], unknowns: int, images: int, variance: float
-) -> tuple[float, float]:
-    """-2 ln of the restricted likelihood at its maximum, and s^2.
+    squares: Float[Array, "kinds c c"], unknowns: int, images: int, variance: float
+) -> tuple[float, float, Float[Array, " kinds"]]:
+    """-2 ln of the restricted likelihood at its maximum, s^2, and the variances of the kinds.
 
-    ``squares`` are, of each kind, the products of the columns: unknowns, errors, coefficients.
+    ``squares`` are those of :func:`_squares`.
     """
     free = np.delete(np.arange(squares.shape[-1]), unknowns)
     rows, along = squares[:, free][..., free], squares[:, free, unknowns]
     own = squares[:, unknowns, unknowns]
     random = len(free) - unknowns
-    kinds, cost = np.ones(3), np.inf
+    kinds, cost = np.ones(len(squares)), np.inf
     for _ in range(_ROUNDS):
-        precision = np.repeat([0.0, 1 / variance], [unknowns, random])
+        precision = np.repeat([_UNDETERMINED, 1 / variance], [unknowns, random])
         matrix = np.tensordot(1 / kinds, rows, axes=1) + np.diag(precision)
         factor = np.linalg.inv(np.linalg.cholesky(matrix))
         inverse = factor.T @ factor
@@ -157,4 +264,4 @@ def _maximised(
         if random:
             spread = best[unknowns:] @ best[unknowns:] + np.trace(inverse[unknowns:, unknowns:])
             variance = float(spread) / random
-    return float(cost), variance
+    return float(cost), variance, kinds

@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 
 from jaxcal.diagnostics.image_errors import ImageErrors, Whitened, quadratic
-from jaxcal.model.thresholds import LARGEST_ELEVATION
+from jaxcal.model.arc import OnArc
 from jaxcal.model.unknowns import TABLE, Blocks, block_slice
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import AnyArray, Bool, Float
@@ -47,9 +47,6 @@ LARGEST_SD = 0.5
 POOLED_SHARE = 0.5
 """How many errors of the pooled variance count with each axis's own. With four or five images an
 axis may have hardly any degree of freedom left, and then has the pooled variance."""
-
-AT_BOUND = 1e-12
-"""An offset within this fraction of its bound counts as on it; the difference is rounding."""
 
 
 @dataclass(frozen=True)
@@ -153,17 +150,6 @@ class Spectra:
             weakest = np.where(degenerate[:, None], nearest_unknown(unseen, null), weakest)
         sd = np.where(unknown, np.nan, np.sqrt(variance / smallest))
         return cls(values[:, -1] / smallest, weakest, sd)
-
-
-def rests_on_bound(
-    y: Float[AnyArray, "*batch n"], force: Float[AnyArray, "*batch n"], limit: AnyArray
-) -> Any:
-    """Whether each offset y (mm) rests on its bound (traceable).
-
-    There the cost falls outwards; ``force`` is half its derivative by y, mm.
-    """
-    xp = array_module(y, force, limit)
-    return (xp.abs(y) >= (1 - AT_BOUND) * limit) & (xp.sign(y) * force <= 0)
 
 
 def rounding(used: Float[AnyArray, "*batch"], lever: Float[AnyArray, "*batch"]) -> Any:
@@ -301,14 +287,11 @@ def _offsets(
         given = seen.problem.max_elevation
         bound = DEFAULT_MAX_ELEVATION_MM if given is None else np.asarray(given)
         y = np.asarray(answer.elevation)
-        residual, axial = seen.from_circle(y)
-        slope = y / axial
-        limit = np.minimum(bound, LARGEST_ELEVATION * np.abs(seen.distance))
-        force = slope * residual[..., 2] - residual[..., 1]
-        at_bound = (kept & rests_on_bound(y, force, limit)).astype(float)
-        rows = seen.circle_rows(axial)
-        through = slope[..., None] * rows[..., 2, :] - rows[..., 1, :]
-        weight = 1 + slope**2
+        arc = OnArc.at(y, (seen.q[..., 1], seen.q[..., 2]), seen.distance, bound)
+        at_bound = (kept & arc.resting).astype(float)
+        rows = seen.circle_rows(arc.axial)
+        through = arc.slope[..., None] * rows[..., 2, :] - rows[..., 1, :]
+        weight = 1 + arc.slope**2
         total = size * (quadratic(through, inverse) / weight + 1) / weight
         kept = kept & (at_bound == 0)
     elif answer.linearisation.tracker_sd is not None:

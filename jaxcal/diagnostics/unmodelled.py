@@ -1,6 +1,6 @@
 """Would an error that the model leaves out explain the residuals better?
 
-Eight are looked for with a few parameters theta, linearised at the answer:
+Nine are looked for with a few parameters theta, linearised at the answer:
 
     scale   the pixels' sizes or the sound speed: x and r are too long by a share of themselves
     lateral the same of x alone, where the sound speed is estimated: a wrong width of the pixels, or
@@ -8,6 +8,8 @@ Eight are looked for with a few parameters theta, linearised at the answer:
     slip    X moves within the image plane, steadily in the course of the recording (elevational
             offsets may drift for other reasons, and do not count)
     step    X moves so at once, between two images
+    displaced  the target moves in the tracker's frame at once, between two images: it was touched,
+            or the tracker or its reference was
     skew    the lateral position is too large by a share of the depth: a steered beam, or clicks
             beside the target
     curve   ranges are too long by the square of the lateral position: an image of a curved array
@@ -22,25 +24,34 @@ With e the whitened errors, J their derivatives by the unknowns and K those by t
 e + J d + K theta gives the likelihood ratio LR. The SDs of the three kinds of errors are tuned
 again, as they were for the answer: 2 ln LR is the sum over the kinds of f ln(before / after), with
 f the kind's degrees of freedom after the fit. By Wilks it is chi squared if theta is zero. It must
-exceed what chance exceeds once in a thousand recordings. That of a step is the largest of all
-places where the step may be. Its limit was found by simulation: Gaussian errors of equal size
-exceed 22 once in a thousand recordings, and errors that grow with depth 26 as often as they exceed
-the limit of a slip. An answer within bounds is first moved to the optimum of Gaussian offsets.
+exceed what chance exceeds once in a thousand recordings. That of a step, of X or of the target, is
+the largest of all places where the step may be. Its limit was found by simulation: Gaussian errors
+of equal size exceed 22 once in a thousand recordings, and errors that grow with depth 26 as often
+as they exceed the limit of a slip. An answer within bounds is first moved to the optimum of
+Gaussian offsets.
 
-A ninth, a distortion of the tracked positions, has a random field instead of few parameters
+A tenth, a distortion of the tracked positions, has a random field instead of few parameters
 (:mod:`jaxcal.diagnostics.tracker_distortion`). Its limit is from simulations with errors that grow
 with depth as well. Half of it must be exceeded without any neighbourhood, too: a few neighbours
-with an error in common imitate a distortion. A tenth, a second target
-or a second origin of the images (:mod:`jaxcal.diagnostics.second_target`), has a parameter for each
-image, which says which of the two it has. It goes first if it is the clearest in spite of the
-n ln 2 that these choices cost.
+with an error in common imitate a distortion. And without the elevational errors: offsets that
+change slowly along a path move the answer, and then errors in the plane change with the pose. The
+same holds for a step.
+An eleventh, markers that are wrong from some sides, has a random field of the orientations and the
+same limits. A twelfth, a second target or a second origin of the images
+(:mod:`jaxcal.diagnostics.second_target`), has a parameter for each image, which says which of the
+two it has. It goes first if it is the clearest in spite of the n ln 2 that these choices cost.
+
+All but the twelfth must exceed their limits also if errors are alike in successive images, as far
+as what is left of them shows it (:mod:`jaxcal.diagnostics.serial_errors`).
 
 References: Wilks 1938; Andrews 1993 (a change at an unknown place).
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -49,6 +60,8 @@ from jaxcal.diagnostics.gaussian_offsets import GaussianOffsets, in_sds, shorten
 from jaxcal.diagnostics.image_errors import ImageErrors
 from jaxcal.diagnostics.second_target import FEWEST as FEWEST_OF_TWO
 from jaxcal.diagnostics.second_target import two_groups
+from jaxcal.diagnostics.serial_errors import correlation, independent
+from jaxcal.diagnostics.tracker_distortion import WITHIN, RandomField
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Bool, Float
 from jaxcal.runtime.arrays import batch_of_one
@@ -56,10 +69,12 @@ from jaxcal.solvers.plan import TUNED
 
 Array = np.ndarray
 
-FEWEST = 12
+FEWEST = 10
 """With fewer images in use nothing is looked for."""
-_FEWEST_CONVENTIONAL = 15
-"""The same for conventional fits: of 300 clean ones of 12 images, 9 would be reported."""
+_FEWEST_OF_ALL, _FEWEST_CONVENTIONAL = 12, 15
+"""With fewer images, or fewer in conventional fits, only a target beside the plane is looked for:
+other errors are imitated by chance (of 300 clean conventional fits of 12 images, 9 would be
+reported)."""
 
 _OF_POINTS = ("scale", "lateral", "skew", "curve")
 """Errors of the measured points (:func:`_excess`); the others are of the poses or the target."""
@@ -69,22 +84,25 @@ _BY_CHANCE = {
     "slip": 16.3,
     "lag": 10.8,
     "step": 26.0,
+    "displaced": 26.0,
     "skew": 10.8,
     "curve": 10.8,
     "beside": 9.5,
     "distortion": 12.0,
+    "marker": 12.0,
 }
 """What 2 ln LR exceeds by chance in one of a thousand recordings: chi squared, for m^2, which is
-never negative, that of two in a thousand, and for a step and a distortion the limits of the
+never negative, that of two in a thousand, and for steps and random fields the limits of the
 module's head."""
-_MOST_STEPS = 16
-"""Most places at which a step is tried, evenly spread."""
-_BESIDE_STEP = 3
-"""Least number of images before and after a step."""
+_AT_ONCE = ("step", "displaced")
+"""Errors that begin with one image; where is looked for."""
+_PLACES = 16
+"""As so many places that are independent of one another count all at which a step may be."""
+_FEWEST_EACH_SIDE, _LEAST_SHARE = 3, 0.1
+"""Least number of images before and after a step, and their least share: a few successive images of
+a stream have errors in common."""
 SIDE_MM = 20.0
 """The lateral position at which a curve is stated."""
-_WITHIN = (0, 2, 4)
-"""Parameters of X that move the image within its plane: laterally, axially, and about y."""
 
 
 @dataclass(frozen=True)
@@ -92,19 +110,20 @@ class Unmodelled:
     """An error that the model leaves out, and that the residuals show.
 
     Attributes:
-        kind: ``scale``, ``lateral``, ``slip``, ``step``, ``skew``, ``curve``, ``lag``, ``beside``,
-            ``distortion``, ``targets`` or ``origins``.
+        kind: ``scale``, ``lateral``, ``slip``, ``step``, ``displaced``, ``skew``, ``curve``,
+            ``lag``, ``beside``, ``distortion``, ``marker``, ``targets`` or ``origins``.
         values: its parameters: by which shares lateral positions and ranges are too long; by which
             lateral positions alone; motion of X from the first image to the last (lateral and
-            axial, mm; about y, rad); by which share of the depth lateral positions are too large;
-            by how many mm ranges are too long 20 mm to the side; the lag of images behind poses in
-            s; the distance m in mm; the root mean square distortion in mm; the distance between
+            axial, mm; about y, rad); motion of the target in the tracker's frame, mm; by which
+            share of the depth lateral positions are too large; by how many mm ranges are too long
+            20 mm to the side; the lag of images behind poses in s; the distance m in mm; the root
+            mean square distortion, or motion of the image on the probe, in mm; the distance between
             two targets in mm; by how much the points of ``images`` are off laterally and axially,
             mm.
         statistic: 2 ln LR.
-        step: by how much the unknowns would change if it were corrected; of a distortion, by one SD
-            of each of its coefficients.
-        image: the first one after a step, or None.
+        step: by how much the unknowns would change if it were corrected; of a distortion or a
+            marker, by one SD of each of its coefficients.
+        image: the first one after a step of X or the target, or None.
         images: those of the second target or the second origin.
     """
 
@@ -133,7 +152,7 @@ class Unmodelled:
             by[:, 1] += self.values[0]
         slip = np.zeros_like(by)
         if self.kind in ("slip", "step"):
-            slip = jacobian[..., _WITHIN] @ self.values
+            slip = jacobian[..., WITHIN] @ self.values
             # At the end of the recording.
             by = by + 0.5 * slip
         size = [float(np.sqrt(np.sum(each**2) / len(points))) for each in (by, slip)]
@@ -148,10 +167,11 @@ def unmodelled(
     Only fits of points are looked at; ``velocity`` is that of a recording's images.
     """
     used = np.asarray(calibration.mask) > 0
-    fewest = _FEWEST_CONVENTIONAL if calibration.method == "conventional" else FEWEST
     points = calibration.data == "points"
-    if calibration.problem is None or not points or used.sum() < fewest:
+    if calibration.problem is None or not points or used.sum() < FEWEST:
         return []
+    conventional = calibration.method == "conventional"
+    few = used.sum() < (_FEWEST_CONVENTIONAL if conventional else _FEWEST_OF_ALL)
     answer = batch_of_one(calibration.numpy())
     if calibration.prior in TUNED:
         seen = ImageErrors.of_answer(answer).centred(answer)
@@ -159,27 +179,15 @@ def unmodelled(
         # Offsets that are free within a bound absorb much of an error, above all a step; and
         # the conventional fit, which has none, weighs them like the other errors.
         seen = GaussianOffsets.of(answer).seen
-    images, known = int(used.sum()), seen.rows.shape[-1]
-    columns = _columns(seen, used)
-    if velocity is not None:
-        columns += _lag(answer, seen, used, velocity)
+    candidates = _candidates(seen, used)
     with np.errstate(all="ignore"):
-        errors, rows = shortened(*_in_sds(answer, seen, used, [each for _, _, each in columns]))
-        before, _ = tuned(errors, rows[..., :known], images)
-        tried, at = [], known
-        for kind, image, own in columns:
-            after = at + own.shape[-1]
-            tried.append((kind, image, rows[..., np.r_[:known, at:after]]))
-            at = after
-        steps = [each for each in tried if each[0] == "step"]
-        gains = _gains(errors, np.stack([part for _, _, part in steps]), before)
-        tried = [each for each in tried if each[0] != "step"] + [steps[int(np.argmax(gains))]]
-        fits = [
-            (image, _fit(kind, errors, part, known, before, images)) for kind, image, part in tried
-        ]
-        found = [replace(each, image=image) for image, each in fits if each is not None]
-        found += _distortion(answer, seen, used)
-        found.sort(key=lambda each: -each.statistic / _BY_CHANCE[each.kind])
+        if few:
+            return _explained(answer, seen, used, [e for e in candidates if e.kind == "beside"])
+        candidates += _steps(answer, seen, used)
+        if velocity is not None:
+            candidates += _lag(answer, seen, used, velocity)
+        found = _explained(answer, seen, used, candidates) + _random_fields(answer, seen, used)
+        found = _clearest_first(found)
         two = _two_groups(answer, seen, used)
     if two is None:
         return found
@@ -188,21 +196,71 @@ def unmodelled(
     return [two, *found] if first else [*found, two]
 
 
-def _columns(
-    seen: ImageErrors, used: Bool[Array, " n"]
-) -> list[tuple[str, int | None, Float[Array, "n 3 k"]]]:
-    """Derivatives of every image's three errors (prediction less measurement) by theta.
+def _clearest_first(found: list[Unmodelled]) -> list[Unmodelled]:
+    """In the order of how far they exceed their limits, but of motions the likelier first.
 
-    With each kind, and the first image after a step.
+    A step has a higher limit, since some of its places fit by chance; that choice costs 2 ln of
+    their number where a slip explains the same motion, too.
     """
+    ordered = sorted(found, key=lambda each: -each.statistic / _BY_CHANCE[each.kind])
+    cost = {"slip": 0.0, **dict.fromkeys(_AT_ONCE, 2 * math.log(_PLACES))}
+    motions = [k for k, each in enumerate(ordered) if each.kind in cost]
+    likelier = sorted((ordered[k] for k in motions), key=lambda e: cost[e.kind] - e.statistic)
+    for k, each in zip(motions, likelier, strict=True):
+        ordered[k] = each
+    return ordered
+
+
+class Candidate(NamedTuple):
+    """An error of a few parameters theta that may have been left out.
+
+    Attributes:
+        kind: as in :class:`Unmodelled`.
+        columns: derivatives by theta of every image's three errors, prediction less measurement.
+        image: the first one after a step of X or the target.
+    """
+
+    kind: str
+    columns: Float[Array, "n 3 k"]
+    image: int | None = None
+
+
+def _explained(
+    answer: Calibration, seen: ImageErrors, used: Bool[Array, " n"], candidates: list[Candidate]
+) -> list[Unmodelled]:
+    """What the candidates explain of the residuals."""
+    images, known = int(used.sum()), seen.rows.shape[-1]
+    columns = [each.columns for each in candidates]
+    errors, rows = _in_sds(answer, seen, used, columns)
+    fewer, of_fewer = shortened(errors, rows)
+    found: list[Unmodelled] = []
+    at = known
+    for each in candidates:
+        after = at + each.columns.shape[-1]
+        # The columns of the unknowns and its own.
+        part = np.r_[:known, at:after]
+        at = after
+        fitted = _fit(each, fewer, of_fewer[..., part], known, images)
+        if fitted is not None:
+            rho = correlation(errors, rows[..., part], fitted[1], np.zeros(len(part)))
+            if rho.any():
+                apart = shortened(independent(errors, rho), independent(rows[..., part], rho))
+                fitted = _fit(each, *apart, known, images)
+        if fitted is not None:
+            found.append(fitted[0])
+    return found
+
+
+def _candidates(seen: ImageErrors, used: Bool[Array, " n"]) -> list[Candidate]:
+    """All that can be looked for without velocities or a place, in mm."""
     distance = seen.distance[0]
     face = float(np.asarray(seen.problem.face_offset)[0])
     zero = np.zeros_like(distance)
     order = (np.cumsum(used) - 1) / (used.sum() - 1) - 0.5
-    within = seen.rows[0][..., _WITHIN] * [[1.0], [1.0], [0.0]]
-    found: list[tuple[str, int | None, Array]] = [
-        ("slip", None, order[:, None, None] * within),
-        ("beside", None, np.stack([zero, 0.5 / distance, zero], axis=-1)[..., None]),
+    within = seen.rows[0][..., WITHIN] * [[1.0], [1.0], [0.0]]
+    found = [
+        Candidate("slip", order[:, None, None] * within),
+        Candidate("beside", np.stack([zero, 0.5 / distance, zero], axis=-1)[..., None]),
     ]
     # An estimated sound speed is the scale of the ranges, so that only the other one can be wrong.
     lengths = {"lateral"} if "sound-speed" in seen.blocks else {"scale"}
@@ -210,19 +268,64 @@ def _columns(
     for kind in _OF_POINTS:
         if kind in looked_for:
             # A measurement without its excess is smaller; the prediction less it is larger.
-            found.append((kind, None, _excess(kind, seen.lateral[0], distance, face)))
+            excess = _excess(kind, seen.lateral[0], distance, face)
+            found.append(Candidate(kind, excess))
+    counted = used[:, None, None]
+    return [each._replace(columns=np.where(counted, each.columns, 0.0)) for each in found]
+
+
+def _steps(answer: Calibration, seen: ImageErrors, used: Bool[Array, " n"]) -> list[Candidate]:
+    """A step of X and one of the target, in mm, each at its clearest place."""
+    of_x = seen.rows[0][..., WITHIN] * [[1.0], [1.0], [0.0]]
+    moved = dict(zip(_AT_ONCE, (of_x, tracker_distortion.by_target(seen)), strict=True))
     images = np.flatnonzero(used)
-    places = np.linspace(_BESIDE_STEP, len(images) - _BESIDE_STEP, _MOST_STEPS)
-    for image in images[np.unique(np.round(places).astype(int))]:
-        after = np.where(np.arange(len(used)) < image, -0.5, 0.5)
-        found.append(("step", int(image), after[:, None, None] * within))
-    return [(kind, image, np.where(used[:, None, None], each, 0.0)) for kind, image, each in found]
+    found: list[Candidate] = []
+    for kind, columns in moved.items():
+        errors, rows = _in_sds(answer, seen, used, [columns])
+        known, own = np.split(rows, [-columns.shape[-1]], axis=-1)
+        before, _ = tuned(*shortened(errors, known), len(images))
+        place = images[_clearest_place(errors, known, own, before)]
+        after = np.where(np.arange(len(used)) < place, -0.5, 0.5) * used
+        found.append(Candidate(kind, after[:, None, None] * columns, int(place)))
+    return found
+
+
+def _clearest_place(
+    errors: Float[Array, "m 3"],
+    known: Float[Array, "m 3 p"],
+    own: Float[Array, "m 3 k"],
+    variance: Float[Array, " 3"],
+) -> int:
+    """After how many of the images a step by ``own`` lowers the sum of squares most.
+
+    The SDs stay as they are.
+    """
+    weight = 1 / np.sqrt(variance)
+    errors, own = errors * weight, own * weight[:, None]
+    scale = np.sqrt(np.maximum(np.sum(known**2, axis=(0, 1)), 1e-300))
+    basis = np.linalg.qr((known / scale * weight[:, None]).reshape(-1, len(scale)))[0]
+    rest = errors.ravel() - basis @ (basis.T @ errors.ravel())
+
+    first = max(_FEWEST_EACH_SIDE, math.ceil(_LEAST_SHARE * len(errors)))
+    places = np.arange(first, len(errors) - first + 1)
+
+    def step(of_images: Array) -> Array:
+        """Half the sum over the images after each place, less half of that before it."""
+        return 0.5 * of_images.sum(axis=0) - np.cumsum(of_images, axis=0)[places - 1]
+
+    # For every place at once: what the step and the unknowns have in common, and the errors.
+    common = step(np.einsum("mik,mip->mkp", own, basis.reshape(*errors.shape, -1)))
+    gradient = step(np.einsum("mik,mi->mk", own, rest.reshape(errors.shape)))
+    normal = 0.25 * np.einsum("mik,mil->kl", own, own) - common @ np.swapaxes(common, 1, 2)
+    inverse = np.linalg.pinv(normal, rcond=1e-9, hermitian=True)
+    gains = np.einsum("sk,skl,sl->s", gradient, inverse, gradient)
+    return int(places[np.argmax(gains)])
 
 
 def _lag(
     answer: Calibration, seen: ImageErrors, used: Bool[Array, " n"], velocity: Float[Array, "n 6"]
-) -> list[tuple[str, int | None, Float[Array, "n 3 1"]]]:
-    """The same by the lag of images behind their poses, s, where the probe moved.
+) -> list[Candidate]:
+    """The lag of images behind their poses, s; none where the probe did not move.
 
     An image shows what was earlier by the lag, at the pose times Exp(-lag [v, omega]).
     """
@@ -235,7 +338,7 @@ def _lag(
     if not motion.any():
         return []
     rows = seen.rows[0][..., :6] * [[1.0], [1.0], [0.0]]
-    return [("lag", None, -np.einsum("nki,ni->nk", rows, motion)[..., None])]
+    return [Candidate("lag", -np.einsum("nki,ni->nk", rows, motion)[..., None])]
 
 
 def _excess(
@@ -274,43 +377,44 @@ def _in_sds(
     return whitened.errors[0][used], whitened.rows[0][used]
 
 
-def _gains(
-    errors: Float[Array, "m 3"], rows: Float[Array, "s m 3 q"], variance: Float[Array, " 3"]
-) -> Float[Array, " s"]:
-    """By how much each set of rows lowers the sum of squares, with the SDs as they are."""
-    weight = 1 / np.sqrt(variance)[:, None]
-    design = (rows * weight).reshape(len(rows), -1, rows.shape[-1])
-    scale = np.sqrt(np.maximum(np.sum(design**2, axis=1, keepdims=True), 1e-300))
-    basis = np.linalg.qr(design / scale)[0]
-    return np.sum((np.swapaxes(basis, 1, 2) @ (errors * weight[:, 0]).ravel()) ** 2, axis=1)
-
-
 def _fit(
-    kind: str,
+    tried: Candidate,
     errors: Float[Array, "m 3"],
     rows: Float[Array, "m 3 q"],
     known: int,
-    before: Float[Array, " 3"],
     images: int,
-) -> Unmodelled | None:
+) -> tuple[Unmodelled, Float[Array, " 3"]] | None:
     """The parameters of the columns after the ``known`` unknowns, if the residuals show them.
 
-    ``before`` are the mean squared errors of each kind without them.
+    With the mean squared errors that they leave of each kind.
     """
-    after, step = tuned(errors, rows, images)
-    # Every kind gives a third of the unknowns' degrees of freedom, and its part of theta's.
-    touched = np.any(rows[..., known:] != 0, axis=(0, 2))
-    further = rows.shape[-1] - known
-    freedom = images - known / 3 - touched * (further / touched.sum())
-    statistic = float(np.sum(freedom * np.log(before / after)))
-    if not statistic > _BY_CHANCE[kind]:
+    statistic, after, step = _statistic(errors, rows, known, images)
+    limit = _BY_CHANCE[tried.kind]
+    if not statistic > limit:
         return None
+    if tried.kind in _AT_ONCE:
+        in_plane, *_ = _statistic(errors[:, :2], rows[:, :2], known, images)
+        if not in_plane > limit / 2:
+            return None
     values, step = step[known:], step[:known]
-    if kind == "beside":
+    if tried.kind == "beside":
         if not values[0] > 0:
             return None
         values = np.sqrt(values)
-    return Unmodelled(kind, values, statistic, step)
+    return Unmodelled(tried.kind, values, statistic, step, tried.image), after
+
+
+def _statistic(
+    errors: Float[Array, "m kinds"], rows: Float[Array, "m kinds q"], known: int, images: int
+) -> tuple[float, Float[Array, " kinds"], Float[Array, " q"]]:
+    """2 ln LR of the columns after the ``known`` unknowns, what they leave, and the step of all."""
+    before, _ = tuned(errors, rows[..., :known], images)
+    after, step = tuned(errors, rows, images)
+    # Every kind gives its share of the unknowns' degrees of freedom, and its part of theta's.
+    touched = np.any(rows[..., known:] != 0, axis=(0, 2))
+    further = rows.shape[-1] - known
+    freedom = images - known / errors.shape[1] - touched * (further / touched.sum())
+    return float(np.sum(freedom * np.log(before / after))), after, step
 
 
 def _two_groups(
@@ -333,20 +437,53 @@ def _two_groups(
     return max(found, key=lambda each: each.statistic, default=None)
 
 
-def _distortion(
+def _random_fields(
     answer: Calibration, seen: ImageErrors, used: Bool[Array, " n"]
 ) -> list[Unmodelled]:
-    """A distortion of the tracked positions, if the residuals of the images show it."""
-    positions = np.asarray(seen.problem.poses)[0, :, :3, 3]
-    errors, rows = _in_sds(answer, seen, used, [tracker_distortion.columns(seen, used)])
+    """A distortion of the tracked positions or wrong markers, if the images' residuals show it."""
+    fields = {
+        "distortion": RandomField.of_positions(seen, used),
+        "marker": RandomField.of_orientations(seen, used),
+    }
     start = float(np.mean(seen.errors[0][used][:, :2] ** 2))
-    found = tracker_distortion.fit(errors, rows, start)
-    if found is None or not found.statistic > _BY_CHANCE["distortion"]:
-        return []
-    for near in tracker_distortion.neighbourhoods(positions[used]):
-        rest = tracker_distortion.fit(errors[~near], rows[~near], start)
-        if rest is None or not rest.statistic > _BY_CHANCE["distortion"] / 2:
-            return []
-    size = tracker_distortion.size(positions, used, found.variance)
-    step = np.sqrt(found.variance) * found.response
-    return [Unmodelled("distortion", np.array([size]), found.statistic, step)]
+    found: list[Unmodelled] = []
+    for kind, field in fields.items():
+        columns = field.columns()
+        errors, rows = _in_sds(answer, seen, used, [columns])
+        best = _fit_field(kind, field.places[used], errors, rows, start, columns.shape[-1])
+        if best is not None:
+            size = np.array([field.size(used, best.variance)])
+            step = np.sqrt(best.variance) * best.response
+            found.append(Unmodelled(kind, size, best.statistic, step))
+    return found
+
+
+def _fit_field(
+    kind: str,
+    places: Float[Array, "m 3"],
+    errors: Float[Array, "m 3"],
+    rows: Float[Array, "m 3 q"],
+    start: float,
+    coefficients: int,
+) -> tracker_distortion.Distortion | None:
+    """A random field of the places that the errors show.
+
+    Also without any neighbourhood, and without the elevational errors.
+    """
+    found = tracker_distortion.fit(errors, rows, start, coefficients)
+    if found is None or not found.statistic > _BY_CHANCE[kind]:
+        return None
+    precision = np.zeros(rows.shape[-1])
+    precision[-coefficients:] = 1 / found.variance
+    rho = correlation(errors, rows, found.kinds, precision)
+    if rho.any():
+        errors, rows = independent(errors, rho), independent(rows, rho)
+        found = tracker_distortion.fit(errors, rows, start, coefficients)
+        if found is None or not found.statistic > _BY_CHANCE[kind]:
+            return None
+    parts = [np.s_[:, :2], *(~near for near in tracker_distortion.neighbourhoods(places))]
+    for part in parts:
+        rest = tracker_distortion.statistic(errors[part], rows[part], start, coefficients)
+        if not rest > _BY_CHANCE[kind] / 2:
+            return None
+    return found

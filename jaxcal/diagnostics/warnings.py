@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from jaxcal.diagnostics.directions import observability
@@ -26,8 +28,14 @@ STEADY = 1e-3
 WEAK_MM = 1.5
 """If the SD of the weakest direction (mm at the target) is larger, there is a warning."""
 WEAK_TRANSLATION_MM = 0.3
+"""If the SD of the translation along the elevational axis is larger, there is a warning."""
+_ALONG = 0.7
+"""Two directions count as one if their cosine exceeds this."""
 WEAK_SHARE = 0.7
 """If the SD of sound speed or delay exceeds this share of its prior SD, the data added little."""
+UNLIKELY_SDS = 3.0
+"""If one of them is farther from its nominal value than this, in the SDs that its prior expects of
+an estimate, and the prior pulls it by more than its SD, there is a warning."""
 
 
 def warnings(result: Calibration) -> list[str]:
@@ -187,7 +195,7 @@ def _weak_direction(result: Calibration) -> list[str]:
     if result.status != "converged" or not isinstance(sd, float) or sd <= WEAK_MM:
         return []
     only = ""
-    if result.prior != "none" and abs(float(result.weakest @ result.prior_direction)) > 0.7:
+    if result.prior != "none" and abs(float(result.weakest @ result.prior_direction)) > _ALONG:
         only = ", known only from the assumed distribution of the offsets"
     return [
         f"weakly determined: {sight['weakest_direction']} (SD {sd:.1f} mm at the target{only}); "
@@ -233,19 +241,28 @@ def _far_from_probe(result: Calibration) -> list[str]:
 
 
 def _medium_warnings(result: Calibration) -> list[str]:
-    """Warnings about a sound speed or a delay that the data hardly determine."""
-    found = []
+    """Warnings about a sound speed or a delay whose prior matters much, or that has none."""
+    found, problem = [], result.problem
+    assumed_speed = None if problem is None else float(problem.nominal_sound_speed)
+    assumed_delay = 0.0 if problem is None or problem.delay is None else float(problem.delay)
     speed = (result.sound_speed_m_s, result.sound_speed_sd_m_s, result.sound_speed_prior_m_s)
     delay = (result.delay_s, result.delay_sd_s, result.delay_prior_s)
-    for name, (value, sd, believed), unit in (
-        ("sound speed", speed, "m/s"),
-        ("delay", delay, "us"),
+    for name, (value, sd, believed), nominal, unit in (
+        ("sound speed", speed, assumed_speed, "m/s"),
+        ("delay", delay, assumed_delay, "us"),
     ):
-        if value is None or sd is None or not np.isfinite(sd):
+        if value is None or sd is None or nominal is None or not np.isfinite(sd):
             continue
         factor = 1e6 if unit == "us" else 1.0
         shown = f"{factor * float(value):.4g} +- {factor * float(sd):.2g} {unit}"
-        if believed is not None and float(sd) > WEAK_SHARE * float(believed):
+        if believed is not None and _pulled(float(value) - nominal, float(sd), float(believed)):
+            found.append(
+                f"the {name} ({shown}) is farther from the nominal {factor * nominal:.4g} {unit} "
+                f"than its prior (SD {factor * float(believed):.2g} {unit}) expects, and the prior "
+                "pulls it back: the true one may lie far beyond it. Take more images"
+                + (", or estimate the scale instead" if name == "sound speed" else "")
+            )
+        elif believed is not None and float(sd) > WEAK_SHARE * float(believed):
             found.append(
                 f"these data hardly determine the {name}: {shown} is little better than its prior "
                 f"(SD {factor * float(believed):.2g} {unit})"
@@ -256,3 +273,20 @@ def _medium_warnings(result: Calibration) -> list[str]:
                 "only times of flight tell the two apart"
             )
     return found
+
+
+def _pulled(away: float, sd: float, prior_sd: float) -> bool:
+    """Whether a prior that the data contradict moves an estimate by more than its SD.
+
+    Args:
+        away: the estimate's distance from the prior's mean.
+        sd: of the estimate, the prior included.
+        prior_sd: SD of the prior; all in one unit.
+    """
+    # If the prior is true, the estimate has this variance.
+    variance = prior_sd**2 - sd**2
+    if not variance > 0:
+        return False
+    # The likelihood alone has its maximum farther away by this.
+    by = abs(away) * sd**2 / variance
+    return abs(away) > UNLIKELY_SDS * math.sqrt(variance) and by > sd

@@ -6,9 +6,7 @@ tracked sequences   ``sequence`` (the type), ``sequence_files`` (``metaimage``, 
                     ``sequence_header``, ``pixel_stream``), ``trackers`` (NDI, Motive),
                     ``tus_rec``
 points              ``slicer`` (markups)
-imports             ``sources`` (options, which kind a file is), ``frame_poses`` (``folder``,
-                    ``poses_by_time``) and ``frame_points`` (what belongs to a frame),
-                    ``target_search``, ``importing`` (the recording)
+imports             ``importing`` (recordings from other programs' files), ``folder`` (PNG)
 transforms          ``itk`` (Slicer), ``plus`` (configurations, fCal), ``ros``, ``tus_rec``
 what all need       ``untrusted`` and ``heap`` (HDF5), ``xml``, ``toml``, ``given_files``,
                     ``frame_names``, ``atomic``

@@ -49,7 +49,7 @@ from jaxcal.data.recording import (
 )
 from jaxcal.io.atomic import write_bytes
 from jaxcal.io.given_files import check_readable, naming, path_name
-from jaxcal.io.target_search import FATES, FrameResults
+from jaxcal.io.importing.target_search import FATES, FrameResults
 from jaxcal.io.untrusted import (
     Node,
     UpTo,

@@ -18,6 +18,7 @@ from jaxcal.io.sequence_header import (
     header_lines,
     orientation_and_kind,
     sequence_of,
+    stated_pixel_size,
     whole_numbers,
     written_orientation,
 )
@@ -97,6 +98,7 @@ def _metaimage_pixels(
         *orientation_and_kind(
             fields.get("UltrasoundImageOrientation", ""), fields.get("UltrasoundImageType", "")
         ),
+        stated_mm=stated_pixel_size(fields.get("ElementSpacing", "").split()),
     )
     skipped = fields.get("HeaderSize", "0")
     if skipped != "0":

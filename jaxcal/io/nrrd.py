@@ -20,6 +20,7 @@ from jaxcal.io.sequence_header import (
     header_lines,
     orientation_and_kind,
     sequence_of,
+    stated_pixel_size,
     whole_numbers,
     written_orientation,
 )
@@ -159,9 +160,17 @@ def _nrrd_pixels(
             ),
             # As Slicer documents its volume sequences; it may also list frames along the last axis.
             interleaved=fields.get("kinds", "").startswith("list"),
+            stated_mm=stated_pixel_size(_axes(fields)),
         ),
         count,
     )
+
+
+def _axes(fields: dict[str, str]) -> list[str]:
+    """Directions or spacings of the axes that have them, the plane's first."""
+    if "space directions" in fields:
+        return re.findall(r"\(([^)]*)\)", fields["space directions"])
+    return [each for each in fields.get("spacings", "").split() if each.lower() != "nan"]
 
 
 def nrrd_header(stack: np.ndarray, orientation: str, compressed: bool) -> list[str]:

@@ -37,6 +37,8 @@ from jaxcal.runtime.messages import quoted
 _STRING = struct.Struct(">HH")
 _US_ASCII = 3
 _LONGEST_REPLY = 1 << 16
+_TIMEOUT_S = 10.0
+"""Within this time the server must accept the connection and reply."""
 
 
 def update_transform(
@@ -46,9 +48,15 @@ def update_transform(
     port: int = PORT,
     *,
     error_mm: float | None = None,
-    timeout_s: float = 10.0,
 ) -> str:
-    """Set a transform in a running PlusServer, which has ``timeout_s`` to reply.
+    """Set a transform in a running PlusServer.
+
+    Args:
+        frames: of the transform, from and to.
+        matrix: takes the first frame to the second, mm.
+        host: of the server.
+        port: of the server.
+        error_mm: of the calibration, which the server keeps with it.
 
     Returns:
         What the server says. It keeps the transform until it ends, and only the command SaveConfig
@@ -62,13 +70,13 @@ def update_transform(
     text = update_transform_command(frames, matrix, error_mm=error_mm).encode("ascii")
     body = _STRING.pack(_US_ASCII, len(text)) + text
     message = Message("STRING", f"CMD_{number}", time.time(), None)
-    due = time.monotonic() + timeout_s
+    due = time.monotonic() + _TIMEOUT_S
     try:
-        with socket.create_connection((host, port), timeout_s) as link:
+        with socket.create_connection((host, port), _TIMEOUT_S) as link:
             link.sendall(encode_header(1, message, body) + body)
             reply = _reply(link, f"ACK_{number}", due)
     except TimeoutError:
-        raise InputError(f"{where}: no reply within {timeout_s:g} s") from None
+        raise InputError(f"{where}: no reply within {_TIMEOUT_S:g} s") from None
     except (OSError, UnicodeError) as error:
         raise InputError(f"{where}: {one_line(error)}") from None
     except InputError as error:

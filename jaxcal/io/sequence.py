@@ -44,6 +44,8 @@ class Pixels:
         orientation: of the stored pixels; None where the file does not say.
         kind: ``BRIGHTNESS`` for B-mode; PLUS's other types are RF data.
         interleaved: for each pixel the numbers of all frames, as 3D Slicer may write them.
+        stated_mm: width and height of a pixel as the header states them; None where both are 1, as
+            PLUS writes them whatever the image shows, or where they are missing.
     """
 
     path: Path
@@ -56,6 +58,7 @@ class Pixels:
     orientation: Orientation | None
     kind: str = "BRIGHTNESS"
     interleaved: bool = False
+    stated_mm: tuple[float, float] | None = None
 
     @property
     def frame_bytes(self) -> int:

@@ -114,6 +114,22 @@ def checked_pixels(pixels: Pixels, count: int) -> Pixels:
         return pixels
 
 
+def stated_pixel_size(axes: Iterable[str]) -> tuple[float, float] | None:
+    """Width and height of a pixel, mm, of texts that state each axis' spacing or direction.
+
+    None where both are 1, which means that nobody set them, or where they cannot be read.
+    """
+    sizes = []
+    for text in axes:
+        try:
+            sizes.append(float(np.linalg.norm([float(each) for each in text.split(",")])))
+        except ValueError:
+            sizes.append(np.nan)
+    width, height = (*sizes, np.nan, np.nan)[:2]
+    stated = np.isfinite([width, height]).all() and width > 0 and height > 0
+    return (width, height) if stated and (width, height) != (1.0, 1.0) else None
+
+
 def check_count(count: int, header: SequenceHeader) -> None:
     """Refuse absurd numbers of frames, and fields of frames that do not exist."""
     if count > MOST_FRAMES:

@@ -35,7 +35,7 @@ from jaxcal.result.calibration import Calibration
 from jaxcal.result.saved import ASKED_FOR
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.given_values import real_array
-from jaxcal.solvers.closed_form.single import solve_problem
+from jaxcal.solvers.closed_form.single import in_closed_form, solve_problem
 
 GOOD_MM = 0.5
 """Largest error to expect at the image (root mean square) that is called good."""
@@ -123,16 +123,16 @@ def _tre(
     places = region.place(unit)[:, [0, 2]]
     transform = answer.image_transform()
     pixels = transform.scale_mm_per_px is not None
-    image = transform._image_points(places)
+    image = transform.image_points(places)
     given = real_array(wanted, "tre_points")
     if given.size:
         if given.ndim != 2 or given.shape[1] != 2:
             raise InputError(f"tre_points must be pairs of numbers, not of shape {given.shape}")
         if not (np.abs(given) <= LARGEST).all():
-            raise InputError(f"points of --tre must be numbers up to {LARGEST:g}")
+            raise InputError(f"tre_points (--tre) must be numbers up to {LARGEST:g}")
         names += (ASKED_FOR,) * len(given)
         image = np.concatenate([image, given])
-        places = np.concatenate([places, transform._in_plane(given)[:, [0, 2]]])
+        places = np.concatenate([places, transform.in_plane(given)[:, [0, 2]]])
     at = tre_at(answer, places)
     cells = region.grid(_ACROSS, _ACROSS).reshape(_ACROSS, _ACROSS, 3)[..., [0, 2]]
     mapped = tre_at(answer, cells)
@@ -241,7 +241,7 @@ def _comparison(
     grid: Float[np.ndarray, "m 2"],
 ) -> dict[str, Any] | None:
     """Compares an answer of another method with the conventional fit of the same images."""
-    estimate = ("scale",) if "scale" in answer.blocks else ()
+    estimate = in_closed_form(answer.blocks)
     further = {"sound-speed", "delay"} & set(answer.blocks)
     problem = answer.problem
     if answer.method == "conventional" or answer.data == "channels" or further or problem is None:

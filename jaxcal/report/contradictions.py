@@ -162,77 +162,115 @@ def _from_unmodelled(record: dict[str, Any]) -> list[tuple[float, str]]:
     found, stated = record["tre"]["unmodelled"], record["tre"]["stated_mm"]
     if found is None or not stated:
         return []
-    values, moved = found["values"], found["moved_mm"]
-    if record["scale_mm_per_px"] is None:
-        lengths = (
-            "check what gave the points their mm (pixel size, sound speed, pitch of the elements) "
-            "and the tracker's unit"
-        )
-    else:
-        lengths = "check pixel size, sound speed and the tracker's unit, or estimate the scale"
+    moved = found["moved_mm"]
     if found["kind"] in ("targets", "origins"):
         # To first order the answer moves by less than it is wrong by, which in simulation was
         # of the order of the distance.
-        moved = max(moved, math.hypot(*values))
-    images = found["images"] or ()
+        moved = max(moved, math.hypot(*found["values"]))
+    what, advice = _explanation(found, pixels=record["scale_mm_per_px"] is not None)
+    words = f"{what} would explain the errors far better: {advice}"
+    return [(math.hypot(1.0, moved / stated), words)]
+
+
+def _explanation(found: dict[str, Any], *, pixels: bool) -> tuple[str, str]:
+    """What would explain the errors, and what to ask or to do about it.
+
+    Args:
+        found: the error that the model leaves out, as in the record.
+        pixels: whether the calibration has pixels.
+    """
+    values, images = found["values"], found["images"] or ()
     more = ["..."] if len(images) > MOST_IMAGES else []
-    those = ", ".join([*map(str, images[:MOST_IMAGES]), *more])
-    words = {
-        "scale": lambda: (
-            f"lateral positions that are {_too_long(values[0])} and ranges that are "
-            f"{_too_long(values[1])} would explain the errors far better: {lengths}"
-        ),
-        "lateral": lambda: (
-            f"lateral positions that are {_too_long(values[0])} would explain the errors far "
-            "better: are the pixels as wide as stated? With a curved array, a wrong sound speed "
-            "stretches the image sideways, too: estimate the scale, not the sound speed"
-        ),
-        "slip": lambda: (
-            f"an image that moves by {found['slip_mm']:.1f} mm on the probe from the first image "
-            "to the last would explain the errors far better: a slipping mount, or a moving target?"
-        ),
-        "step": lambda: (
-            f"an image that moves by {found['slip_mm']:.1f} mm on the probe near image "
-            f"{found['image']} (counted from 0) would explain the errors far better: has the mount "
-            "slipped there, or the target moved? Calibrate from the images before it, or after it"
-        ),
-        "lag": lambda: (
-            f"{'images' if values[0] > 0 else 'poses'} that lag {abs(values[0]):.3f} s behind "
-            f"their {'poses' if values[0] > 0 else 'images'} would explain the errors far better: "
-            f"import again with a --lag that is {abs(values[0]):.3f} s "
-            f"{'larger' if values[0] > 0 else 'smaller'}, or hold the probe still for each image"
-        ),
-        "skew": lambda: (
-            f"lateral positions that are too large by {100 * values[0]:.1f} % of the depth would "
-            "explain the errors far better: a steered beam, or clicks beside the target?"
-        ),
-        "curve": lambda: (
-            f"ranges that are too long by {values[0]:.1f} mm {SIDE_MM:.0f} mm to either side of "
-            "the middle would explain the errors far better: a curved array taken for a straight "
-            "one, or the delays of another probe?"
-        ),
-        "beside": lambda: (
-            f"a target {values[0]:.1f} mm beside the image plane in all images would explain the "
-            "errors far better: take images from both sides of it"
-        ),
-        "distortion": lambda: (
-            f"tracked positions that are off by {values[0]:.1f} mm (RMS), by nearly the same where "
-            "the probe is nearly in the same place, would explain the errors far better: metal "
-            "near an electromagnetic tracker, the edge of its range, or, along a single path, "
-            "errors that change slowly? Record again without it: more images hardly help"
-        ),
-        "targets": lambda: (
-            f"a second target, {values[0]:.1f} mm from the first one, in images {those} (counted "
-            "from 0) would explain the errors far better: were two targets, or two echoes of one, "
-            "marked in turn?"
-        ),
-        "origins": lambda: (
-            f"points that are off by {values[0]:.1f} mm sideways and {values[1]:.1f} mm in depth "
-            f"in images {those} (counted from 0) would explain the errors far better: were these "
-            "images cropped or zoomed in another way, or another echo marked in them?"
-        ),
-    }
-    return [(math.hypot(1.0, moved / stated), words[found["kind"]]())]
+    those = f"images {', '.join([*map(str, images[:MOST_IMAGES]), *more])} (counted from 0)"
+    match found["kind"]:
+        case "scale":
+            return (
+                f"lateral positions that are {_too_long(values[0])} and ranges that are "
+                f"{_too_long(values[1])}",
+                "check pixel size, sound speed and the tracker's unit, or estimate the scale"
+                if pixels
+                else "check what gave the points their mm (pixel size, sound speed, pitch of the "
+                "elements) and the tracker's unit",
+            )
+        case "lateral":
+            return (
+                f"lateral positions that are {_too_long(values[0])}",
+                "are the pixels as wide as stated? With a curved array, a wrong sound speed "
+                "stretches the image sideways, too: estimate the scale, not the sound speed",
+            )
+        case "slip":
+            return (
+                f"an image that moves by {found['slip_mm']:.1f} mm on the probe from the first "
+                "image to the last",
+                "a slipping mount, or a moving target?",
+            )
+        case "step":
+            return (
+                f"an image that moves by {found['slip_mm']:.1f} mm on the probe near image "
+                f"{found['image']} (counted from 0)",
+                "has the mount slipped there, the target moved, or the image's depth changed? "
+                "Calibrate from the images before it, or after it",
+            )
+        case "displaced":
+            return (
+                f"a target that moves by {math.hypot(*values):.1f} mm near image {found['image']} "
+                "(counted from 0)",
+                "was it touched there, or the tracker or its reference? Calibrate from the images "
+                "before it, or after it",
+            )
+        case "lag":
+            late, early = ("images", "poses") if values[0] > 0 else ("poses", "images")
+            larger = "larger" if values[0] > 0 else "smaller"
+            lag = f"{abs(values[0]):.3f} s"
+            return (
+                f"{late} that lag {lag} behind their {early}",
+                f"import again with a --lag that is {lag} {larger}, or hold the probe still for "
+                "each image",
+            )
+        case "skew":
+            return (
+                f"lateral positions that are too large by {100 * values[0]:.1f} % of the depth",
+                "a steered beam, or clicks beside the target?",
+            )
+        case "curve":
+            return (
+                f"ranges that are too long by {values[0]:.1f} mm {SIDE_MM:.0f} mm to either side "
+                "of the middle",
+                "a curved array taken for a straight one, or the delays of another probe?",
+            )
+        case "beside":
+            return (
+                f"a target {values[0]:.1f} mm beside the image plane in all images",
+                "take images from both sides of it",
+            )
+        case "distortion":
+            return (
+                f"tracked positions that are off by {values[0]:.1f} mm (RMS), by nearly the same "
+                "where the probe is nearly in the same place,",
+                "metal near an electromagnetic tracker, the edge of its range, or, along a single "
+                "path, errors that change slowly? Record again without it: more images hardly help",
+            )
+        case "marker":
+            return (
+                f"an image that moves by {values[0]:.1f} mm (RMS) on the probe with the probe's "
+                "orientation",
+                "are the probe's markers wrong, or partly hidden, from some sides, does the target "
+                "look different from them, or, along a single path, do errors change slowly?",
+            )
+        case "targets":
+            return (
+                f"a second target, {values[0]:.1f} mm from the first one, in {those}",
+                "were two targets, or two echoes of one, marked in turn?",
+            )
+        case "origins":
+            return (
+                f"points that are off by {values[0]:.1f} mm sideways and {values[1]:.1f} mm in "
+                f"depth in {those}",
+                "were these images cropped or zoomed in another way, or another echo marked in "
+                "them?",
+            )
+        case kind:
+            raise AssertionError(kind)
 
 
 def _from_groups(record: dict[str, Any]) -> list[tuple[float, str]]:

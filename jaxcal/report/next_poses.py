@@ -67,7 +67,7 @@ def pose_records(plan: design.Plan, result: Calibration | None = None) -> list[d
     size = None if transform is None else transform.scale_mm_per_px
     # Images that do not determine a pixel's size may make it zero.
     if transform is not None and size is not None and (size > 0).all():
-        pixels = transform._image_points(targets).tolist()
+        pixels = transform.image_points(targets).tolist()
     return [
         {
             "words": design.pose_in_words(pose, bounds, model.image_to_probe, model.point),

@@ -578,7 +578,7 @@ def _plain(name: str) -> str:
 def _in_unit(name: str, sd: float) -> str:
     if name.endswith("_rad"):
         return f"{math.degrees(sd):.3g} deg"
-    if name == "delay":
+    if name == "delay_mm":
         return f"{sd:.3g} mm of distance"
     return f"{100 * sd:.3g} %" if name.startswith("log_") else f"{sd:.3g} mm"
 

@@ -167,7 +167,8 @@ def where(record: dict[str, Any]) -> list[str]:
     if tre is None or tre.get("rms_mm") is None:
         return []
     named = {point["name"]: point for point in tre["points"] if point["name"] != ASKED_FOR}
-    # The mean square error is convex, so that it is largest in a corner; it is smallest anywhere.
+    # The mean square error is convex in the place, so it is largest in a corner. Where it is
+    # smallest is not said: that may be anywhere.
     worst = max(named.values(), key=lambda point: point["tre_mm"])
     lines = [
         f"In {_place(named['middle'])} it is {_mm(named['middle']['tre_mm'])}; at worst, in "
@@ -336,6 +337,12 @@ def certainty(record: dict[str, Any]) -> list[str]:
         f"largest along its {_AXES[along]} axis. That of its orientation is "
         f"{spread[1]:{length_form(spread[1])}} degrees, largest about its {_AXES[about]} axis."
     ]
+    if record["method"] == "conventional":
+        lines.append(
+            "The method takes every target to lie in the image plane. If they lie to one side of "
+            "it on average, the image is off by as much, and the residuals of few images hardly "
+            "show it."
+        )
     unseen = record["observability"]["known_only_from_prior"]
     if unseen and record["prior"] in TUNED:
         lines.append(

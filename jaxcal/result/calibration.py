@@ -545,13 +545,20 @@ class Calibration:
 
         Args:
             tre_points: further image points, in the images' unit, for which to give the error.
+
+        Raises:
+            InputError: a batch, or points that are not pairs of numbers up to 1e7.
         """
         from jaxcal.report.in_memory import record_of
 
         return record_of(self, tre_points)
 
     def verdict(self) -> list[str]:
-        """How accurate the calibration is, what limits it and what to do, in sentences."""
+        """How accurate the calibration is, what limits it and what to do, in sentences.
+
+        Raises:
+            InputError: a batch.
+        """
         from jaxcal.report.verdict import verdict
 
         return verdict(self.record())

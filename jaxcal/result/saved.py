@@ -187,7 +187,7 @@ def text_of(transform: ImageTransform, format: SaveFormat, *, frames: FramePair)
         from jaxcal.io.tus_rec import calib_matrix
 
         matrix = transform.plus_matrix()
-        scale = transform._scale() * [1.0, transform.range_factor]
+        scale = transform.pixel_size_mm()
         rigid = matrix.copy()
         rigid[:3, :3] /= [*scale, scale.mean()]
         return calib_matrix(rigid, scale)

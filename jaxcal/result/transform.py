@@ -189,7 +189,7 @@ class ImageTransform:
             InputError: the calibration knows no pixel size: it was made from points in mm, or read
                 from a file that holds none.
         """
-        s_u, s_v = self._scale() * [1.0, self.range_factor]
+        s_u, s_v = self.pixel_size_mm()
         lateral, elevational, axial, origin = self.image_plane_to_probe[:3].T
         matrix = np.eye(4)
         matrix[:3, 0] = s_u * lateral
@@ -271,7 +271,7 @@ class ImageTransform:
         # Written so that NaN is refused, too.
         if not ((own >= 0) & (own <= _LARGEST)).all():
             raise InputError(f"pixel_sd_px must be from 0 to {_LARGEST:g}")
-        plane = self._in_plane(pixels)
+        plane = self.in_plane(pixels)
         count, rotation = len(plane), self.image_plane_to_probe[:3, :3]
         points = plane @ rotation.T + self.image_plane_to_probe[:3, 3]
         factor = self.error_factor(pixels)
@@ -303,7 +303,7 @@ class ImageTransform:
         Raises:
             InputError: as :meth:`apply`.
         """
-        plane = self._in_plane(pixels)
+        plane = self.in_plane(pixels)
         covariance, blocks = self.image_covariance, self.unknowns
         if covariance is None:
             covariance, blocks = self.covariance, ("translation", "rotation")
@@ -319,8 +319,15 @@ class ImageTransform:
         scale = np.ones(2) if self.scale_mm_per_px is None else self.scale_mm_per_px
         return scale * np.array([1.0, self.range_factor])
 
-    def _in_plane(self, pixels: np.ndarray) -> Float[np.ndarray, "n 3"]:
-        """Image points in the image frame, mm."""
+    def in_plane(self, pixels: np.ndarray) -> Float[np.ndarray, "n 3"]:
+        """Image points in the image frame, [lateral, 0, axial] mm.
+
+        Args:
+            pixels: as in :meth:`apply`.
+
+        Raises:
+            InputError: another shape, NaN or numbers over 1e9.
+        """
         measured = real_array(pixels, "pixels")
         measured = measured[None] if measured.ndim == 1 else measured
         if measured.ndim != 2 or measured.shape[1] != 2:
@@ -332,18 +339,30 @@ class ImageTransform:
         plane[:, [0, 2]] = self._mm_per_px() * measured + np.array([0.0, self.face_offset_mm])
         return plane
 
-    def _image_points(self, places: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """Image points, px or mm as measured, from [lateral, axial] in the image frame, mm."""
+    def image_points(self, places: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+        """Image points as measured, the inverse of :meth:`in_plane`.
+
+        Args:
+            places: (n, 2) [lateral, axial] in the image frame, mm.
+
+        Returns:
+            (n, 2) [u, v] px, or [lateral, range] mm where there are no pixels.
+        """
         return (places - np.array([0.0, self.face_offset_mm])) / self._mm_per_px()
 
-    def _scale(self) -> Float[np.ndarray, " 2"]:
+    def pixel_size_mm(self) -> Float[np.ndarray, " 2"]:
+        """[lateral, axial] size of a pixel at the estimated sound speed, mm.
+
+        Raises:
+            InputError: the calibration knows no pixel size.
+        """
         if self.scale_mm_per_px is None:
             raise InputError(
                 f"{self.source}: no pixel size is known, so there is no Image frame in pixels: "
                 "give the size of a pixel and the pixel of lateral 0, range 0 (jaxcal export with "
                 "--pixel-size and --origin; in Python with_pixels)"
             )
-        return self.scale_mm_per_px
+        return self._mm_per_px()
 
     def save(
         self,
@@ -466,11 +485,12 @@ def transform_from_plus_matrix(
             )
     lateral, axial = (matrix[:3, :2] / scale).T
     if abs(lateral @ axial) > _SKEWED:
+        # Rounding may leave a cosine beyond 1.
+        apart = math.degrees(np.arccos(np.clip(lateral @ axial, -1.0, 1.0)))
         raise InputError(
-            f"{source}: rows and columns of pixels are "
-            f"{math.degrees(math.acos(lateral @ axial)):.3f} degrees apart: fCal fitted the matrix "
-            "without a constraint (OptimizationMethod NONE), or it was rounded, so that it is no "
-            "rigid transform and pixel size"
+            f"{source}: rows and columns of pixels are {apart:.3f} degrees apart: fCal fitted the "
+            "matrix without a constraint (OptimizationMethod NONE), or it was rounded, so that it "
+            "is no rigid transform and pixel size"
         )
     # The nearest orthonormal pair, then y = z cross x.
     u, _, vt = np.linalg.svd(np.stack([lateral, axial], axis=1), full_matrices=False)

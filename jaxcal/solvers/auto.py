@@ -1,4 +1,4 @@
-"""The estimator behind ``--method joint``: nothing to choose, and it says what it found.
+"""The estimator of the joint method with the priors ``auto`` and ``uniform``.
 
 The plain self-tuned fit (:mod:`jaxcal.solvers.reml`) assumes that the offsets are Gaussian, that
 their mean is zero, and that errors are alike in all images. Here the data are asked whether that is
@@ -74,10 +74,10 @@ The evidence is stationary in the sites, so it is nearly right before the mean i
 not settle at all need to be left out."""
 
 LARGEST_GAIN = 10.0
-"""... and as long as the last sweep but one changed the log evidence by no more than about this.
+"""A law counts only if the last sweep but one changed the log evidence by less than about this.
 
-Where edges exclude an image, the evidence may rise or fall by thousands between sweeps, as rounding
-has it; where it settles, it changes by tenths, which must not matter."""
+Where edges exclude an image, rounding decides whether the evidence rises or falls, by thousands
+from one sweep to the next. Where it settles, it changes by tenths, which must not matter."""
 
 MEDIAN_STEPS = 12
 """Weiszfeld's steps to the median."""

@@ -22,8 +22,8 @@ LARGE_BATCH = 4096
 far fewer side by side."""
 
 FEW = 16
-"""The problems that go on alone are at most this share of the batch. On an H100, a pass over a
-sixteenth of 65,536 problems of 20 images takes little longer than one over a single problem."""
+"""At most one problem in so many goes on alone. On an H100, a pass over a sixteenth of 65,536
+problems of 20 images takes little longer than one over a single problem."""
 
 
 def until_done(

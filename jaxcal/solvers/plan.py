@@ -100,8 +100,15 @@ class Options:
 class SolvePlan:
     """Everything static about a solve: method, belief about the offsets, data, unknowns.
 
-    ``laws`` are weighed after the self-tuned Gaussian solve; if there are none, the Gaussian solve
-    is the answer. ``robust``: find the images that agree first, and leave the others out.
+    Attributes:
+        method: as requested.
+        prior: what the solve assumes about the offsets; with ``laws`` it is ``gaussian``.
+        self_tuning: whether SDs are estimated.
+        laws: weighed after the self-tuned Gaussian solve, which is the answer if there are none.
+        channels: whether residuals are those of every element's time of flight, not of points.
+        blocks: of unknowns (:mod:`jaxcal.model.unknowns`).
+        options: as requested.
+        robust: whether the images that agree are found first, and the others left out.
     """
 
     method: Method

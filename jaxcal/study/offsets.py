@@ -23,6 +23,8 @@ the same seed.
 
 from __future__ import annotations
 
+from typing import assert_never
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -52,7 +54,7 @@ def standard_offsets(key: Key[Array, ""], law: LawName, count: int) -> Float[Arr
 
     Args:
         key: of the draw.
-        law: one of :data:`OFFSET_LAWS`.
+        law: one of :data:`jaxcal.study.laws.OFFSET_LAWS`.
         count: how many.
 
     Raises:
@@ -97,7 +99,9 @@ def standard_offsets(key: Key[Array, ""], law: LawName, count: int) -> Float[Arr
     if law == "triangular":
         pair = draws.uniforms(key, 0, 2 * count).reshape(2, count)
         return pair[0] - pair[1]
-    return 2 * draws.uniforms(key, 0, count) - 1
+    if law == "uniform":
+        return 2 * draws.uniforms(key, 0, count) - 1
+    assert_never(law)
 
 
 def nominal_bound(law: LawName, size: float) -> float:

@@ -9,7 +9,7 @@ chunks. A short last block is filled up, and the results of the added trials are
 All methods are computed by :mod:`jaxcal.study.trials`.
 
 The programs are compiled for one thread each: trials are independent, so that processes, one for
-each group of cores (:mod:`jaxcal.study.cluster`), use several cores better than XLA's thread pool
+each group of cores (:mod:`jaxcal.study.workers`), use several cores better than XLA's thread pool
 does, and neither results nor progress depend on how that pool is scheduled.
 
 If a host has several devices, each takes its share of a block.
@@ -63,9 +63,10 @@ def compute_chunk(spec: Spec, chunk: Chunk) -> dict[str, np.ndarray]:
         chunk: one of its chunks.
 
     Returns:
-        Arrays by name: those of :class:`TrialResults` (methods, trials, ...) and ``realised``
-        (trials, 3), the root mean square errors of lateral position, range and elevational offset
-        that were drawn, mm. They depend neither on what was computed before nor on the worker.
+        Arrays by name: those of :class:`jaxcal.study.trials.TrialResults` (methods, trials, ...)
+        and ``realised`` (trials, 3), the root mean square errors of lateral position, range and
+        elevational offset that were drawn, mm. They depend neither on what was computed before nor
+        on the worker.
     """
     condition, devices = spec.condition(chunk.condition), tuple(jax.local_devices())
     pieces, size = _block(spec, devices)
@@ -118,7 +119,7 @@ class Block:
         return self._begun[max_steps]
 
     def measured(self, method: MethodSpec) -> dict[str, np.ndarray]:
-        """What one method makes of it: the arrays of :class:`TrialResults`."""
+        """What one method makes of it: the arrays of :class:`jaxcal.study.trials.TrialResults`."""
         given = method.bound_given is not None
         bound = np.asarray(bound_mm(method, self._condition)) if given else None
         kind: Kind = (method.method, method.prior)

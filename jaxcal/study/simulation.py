@@ -212,7 +212,7 @@ _AXIS, _TURN, _PLACE, _POSITION, _NOISE, _TRACKER = range(6)
 
 
 class Planes(eqx.Module):
-    """The geometry of one experiment as the fused solvers read it: images are the last axis.
+    """The geometry of one experiment in planes, as the solvers read it: images are the last axis.
 
     Attributes:
         rotation: R_i by rows.
@@ -520,8 +520,7 @@ def simulate_recording(
     Raises:
         InputError: a seed that is no whole number from 0 to 2^63 - 1, or a clock without times.
     """
-    if not isinstance(protocol, Protocol):
-        raise InputError(f"a jaxcal.Protocol is needed, not {type(protocol).__name__}")
+    check_made("protocol", protocol, Protocol, "jaxcal.Protocol")
     seed = whole_number("seed", seed, 0, LARGEST_SEED)
     curved = isinstance(protocol.probe, CurvilinearProbe)
     if clock_hz is not None and not (protocol.raw or curved):

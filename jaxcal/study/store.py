@@ -135,7 +135,7 @@ class Store(Generic[S]):
         Args:
             chunk: which.
             results: of :func:`jaxcal.study.interface.computed`.
-            maker: what computed it, as :func:`jaxcal.study.pipeline.made_by` says it.
+            maker: what computed it, as :func:`jaxcal.study.interface.made_by` says it.
 
         Raises:
             OutputError: the disk is full, the folder not writable.

@@ -35,7 +35,7 @@ from scipy.spatial.transform import Rotation
 import jaxcal
 from hw.acquisition.outcome import calibrate_and_print
 from hw.cli.main import main
-from hw.freehand.acquire import acquire_free_hand
+from hw.freehand.acquire import acquire_free_hand, agreement
 from hw.freehand.guide import Guide, Rules, Taken, orientation_sds
 from hw.freehand.posed import PosedImage, PosedImages
 from hw.freehand.request import FreeHand, FreeHandStopped
@@ -235,6 +235,24 @@ def test_what_is_not_taken_is_said(tmp_path):
     images = jaxcal.load(tmp_path / "r.h5").calibration
     assert (len(images), int(images.mask.sum())) == (6, 5)
     assert not images.mask[2]
+
+
+def test_the_image_that_does_not_agree_is_named():
+    poses, pixels = holds(12, 1)
+    rows = [0, 1, *range(3, 13)]
+    taken = [
+        Taken(pose, pixel, np.eye(2), 0.0, row=row)
+        for pose, pixel, row in zip(poses, pixels, rows, strict=True)
+    ]
+    astray = [replace(each, pixel=each.pixel + np.array([20.0, 0.0])) for each in taken]
+    assert agreement(taken[:5], SPACING_MM) == ""
+    assert re.fullmatch(r"; the images agree to \d\.\d\d mm", agreement(taken, SPACING_MM))
+    # By its number in the recording, in which one was taken back.
+    told = r"; the images agree to \d+\.\d\d mm; image {} stands out by \d+\.\d mm"
+    earlier = [*taken[:3], astray[3], *taken[4:]]
+    assert re.fullmatch(told.format(4), agreement(earlier, SPACING_MM))
+    last = [*taken[:11], astray[11]]
+    assert re.fullmatch(told.format(12) + r" \(u removes it\)", agreement(last, SPACING_MM))
 
 
 def test_a_lost_stream_is_gone_on_with(tmp_path, plus_server):

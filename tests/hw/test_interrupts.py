@@ -4,15 +4,22 @@ from __future__ import annotations
 
 import gc
 import os
+import re
 import signal
 import sys
 import threading
+import time
+from contextlib import suppress
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 from hw.cli.confirming import typed_code
+from hw.runtime import interrupts
 from hw.runtime.interrupts import as_interrupts, heed_interrupt
 from hw.runtime.keys import Pause
+from hw.ultrasound.receiver import UltrasoundStream
 
 pytestmark = pytest.mark.skipif(
     threading.current_thread() is not threading.main_thread() or sys.platform == "win32",
@@ -83,3 +90,52 @@ def test_an_interrupt_right_before_an_endless_wait_ends_it(monkeypatch, where):
         timers[1].cancel()
     os.close(keyboard)
     assert not late.is_set()
+
+
+def test_an_interrupt_leaves_no_lock_taken():
+    """The thread that receives then waited for ever, and the end of the program for that thread."""
+    stream, over = UltrasoundStream("127.0.0.1", 1), threading.Event()
+    rng = np.random.default_rng(0)
+
+    def receive() -> None:
+        while not over.is_set():
+            with stream._changed:
+                sum(range(2000))
+            sum(range(200))
+
+    def interrupt(after_s: float) -> None:
+        time.sleep(after_s)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    def take_it() -> None:
+        if stream._changed.acquire(timeout=1.0):
+            stream._changed.release()
+            free.append(True)
+
+    receiving = threading.Thread(target=receive, daemon=True)
+    receiving.start()
+    for after_s in rng.uniform(0.0005, 0.01, 50):
+        interrupting = threading.Thread(target=interrupt, args=(after_s,))
+        with as_interrupts():
+            with suppress(KeyboardInterrupt):
+                interrupting.start()
+                while True:
+                    stream.transforms()
+                    heed_interrupt()
+            interrupting.join()
+        free: list[bool] = []
+        taking = threading.Thread(target=take_it)
+        taking.start()
+        taking.join()
+        assert free
+    over.set()
+    receiving.join()
+
+
+def test_only_locks_are_entered():
+    """See :func:`hw.runtime.interrupts.lock_and_condition`."""
+    folder = Path(interrupts.__file__).parents[1]
+    made = [path for path in folder.rglob("*.py") if "threading.Condition(" in path.read_text()]
+    assert made == [Path(interrupts.__file__)]
+    entered = re.compile(r"with [\w.]*(condition|changed)\b")
+    assert not [path for path in folder.rglob("*.py") if entered.search(path.read_text())]

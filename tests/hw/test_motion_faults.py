@@ -33,6 +33,7 @@ from robots import CB_SERIES, E_SERIES, EmulatedRobot
 from suspending import suspend
 
 from hw.robot.identity import stop_program
+from hw.robot.limits import CALLER_S
 from hw.robot.motion import Motion
 from hw.runtime.errors import DeviceError, LostError, RefusedError, StaleError, StoppedError
 from jaxcal.runtime.isolated import import_path
@@ -152,7 +153,7 @@ def check_fault(robot: EmulatedRobot, name: str, kind: type, text: str, ends: bo
         return reasons[0]
 
     # On a machine with other work any caller is silent for a while; only one case is about that.
-    patience = 0.15 if name == "silent" else 2.0
+    patience = CALLER_S if name == "silent" else 2.0
     put_in_order(robot)
     with moving(robot, guard=guard, caller_s=patience) as motion:
         faults = {

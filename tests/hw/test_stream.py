@@ -140,6 +140,8 @@ def test_a_mute_controller_makes_poses_stale_and_then_lost():
             with pytest.raises(LostError, match=r"silent for 2 s"):
                 again_and_again(poses.latest, after=StaleError)
             assert poses.drain()[-1].raw == pytest.approx(START)
+            with pytest.raises(LostError):
+                poses.awaited()
         start = time.monotonic()
         with pytest.raises(LostError, match="does not answer"):
             PoseStream(robot.host, clock=robot.clock, timeout_s=0.5).start()
@@ -147,6 +149,24 @@ def test_a_mute_controller_makes_poses_stale_and_then_lost():
             read_identity(robot.host, timeout_s=0.5)
         # A second, and what it takes to start an interpreter.
         assert time.monotonic() - start < 120.0
+
+
+@pytest.mark.real_time
+def test_a_robot_at_rest_may_be_silent_for_a_moment():
+    """A machine busy for a tenth of a second ended an acquisition in which nothing moved."""
+    with (
+        EmulatedRobot() as robot,
+        PoseStream(robot.host, clock=robot.clock, timeout_s=60.0) as poses,
+    ):
+        robot.ask("mute")
+        time.sleep(0.3)
+        with pytest.raises(StaleError):
+            poses.latest()
+        with pytest.raises(StaleError):
+            poses.awaited(0.1)
+        muted = robot.clock.now()
+        threading.Timer(0.2, robot.ask, ["unmute"]).start()
+        assert poses.awaited(60.0).t_host > muted
 
 
 @pytest.mark.real_time

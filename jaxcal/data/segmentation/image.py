@@ -49,6 +49,8 @@ MAXIMUM_FRAMES = 100_000
 """Most frames in one call."""
 LARGEST_SPOT = 0.25
 """A spot whose SD is more than this fraction of the region is a structure, not a target."""
+_CUT = 10 ** (-36 / 20)
+"""A spot that falls below this share of its peak, beside a pixel above half of it, is cut off."""
 
 
 @dataclass(frozen=True)
@@ -331,6 +333,8 @@ def _localise_one(
             )
         _check_shape(shape, extent)
         spot = fit_spot(envelope, saturated_pixels(values), shape, extent, speckle, target, margin)
+        if _cut_off(shape, values, envelope / envelope[peak]):
+            raise NotFoundError("the bright spot is cut off by the edge of the image")
         if expected is not None and np.linalg.norm(spot.position - expected) > radius:
             raise NotFoundError("the spot lies farther from the expected place")
     except NotFoundError as reason:
@@ -348,3 +352,18 @@ def _check_shape(shape: np.ndarray, extent: tuple[float, float]) -> None:
         raise NotFoundError("the bright spot is cut off by the border")
     if (np.array(extent) > LARGEST_SPOT * np.array(shape.shape)).any():
         raise NotFoundError("the bright area is a structure, not a spot")
+
+
+def _cut_off(shape: np.ndarray, values: np.ndarray, share: np.ndarray) -> bool:
+    """Whether a spot ends at once, as at the edge of a sector: no point spread falls so steeply.
+
+    The pixels must fall by half of the display's range as well, since the range in dB is estimated.
+    """
+    steps = 0
+    for axis in (0, 1):
+        for a, b in ((slice(1, None), slice(None, -1)), (slice(None, -1), slice(1, None))):
+            inside = (slice(None),) * axis + (a,)
+            beside = (slice(None),) * axis + (b,)
+            steep = values[inside] - values[beside] >= 0.5 * np.ptp(values)
+            steps += np.sum(shape[inside] & steep & (share[beside] < _CUT))
+    return bool(steps >= 2)

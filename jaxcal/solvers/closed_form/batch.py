@@ -74,8 +74,8 @@ def solve_batch(problems: Problem, estimate: tuple[str, ...], *, few: int = FEW)
     Returns:
         Arrays with the problems' leading axes. Concrete problems give numpy arrays in float64. Few
         of them, and those that this module does not certify, are solved one by one, by
-        :func:`jaxcal.solvers.closed_form.single.solve`. A problem with NaN or fewer than 4 images
-        gives NaN.
+        :func:`jaxcal.solvers.closed_form.single.solve_problem`. A problem with NaN or fewer than 4
+        images gives NaN.
 
     Raises:
         InputError: unknown names, a scale where there is none, or a transformation that began

@@ -140,6 +140,11 @@ def solve_problem(problem: Problem, estimate: tuple[str, ...] = ()) -> ClosedFor
     return _assemble(x, certificate, reduced, data)
 
 
+def in_closed_form(blocks: Blocks) -> tuple[str, ...]:
+    """Which of the unknowns :func:`solve_problem` estimates beside X and the target."""
+    return tuple(name for name in blocks if name == "scale")
+
+
 def closed_form_start(problem: Problem, blocks: Blocks) -> Start:
     """The start of a method, from the closed form of Eq. 7.
 
@@ -151,7 +156,7 @@ def closed_form_start(problem: Problem, blocks: Blocks) -> Start:
         The start in the problem's own precision.
     """
     known = replace(problem, spacing_known=True, channels=None)
-    found = solve_problem(known, ("scale",) if "scale" in blocks else ())
+    found = solve_problem(known, in_closed_form(blocks))
     scale = np.ones(2)
     if found.scale_mm_per_px is not None:
         scale = np.asarray(found.scale_mm_per_px) / np.asarray(problem.spacing)

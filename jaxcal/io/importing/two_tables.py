@@ -10,8 +10,13 @@ from typing import Literal
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.io.frame_poses import tracking_of_table
-from jaxcal.io.poses_by_time import PoseTrack, better_lag, lag_of_points, with_poses_by_time
+from jaxcal.io.importing.frame_poses import tracking_of_table
+from jaxcal.io.importing.poses_by_time import (
+    PoseTrack,
+    better_lag,
+    lag_of_points,
+    with_poses_by_time,
+)
 from jaxcal.io.sequence import TrackedSequence
 from jaxcal.io.text import PoseTable
 from jaxcal.runtime.array_types import Bool, Float

@@ -11,9 +11,9 @@ from jaxcal import InputError
 from jaxcal.data.poses import inverse_poses
 from jaxcal.io.folder import PROBE_TO_TRACKER, with_pose_table
 from jaxcal.io.frame_names import FramePair, capitalised
-from jaxcal.io.poses_by_time import times_of_table, with_poses_by_time
+from jaxcal.io.importing.poses_by_time import times_of_table, with_poses_by_time
+from jaxcal.io.importing.sources import ImportOptions, kind_of, read_rows, read_tracked, refuse
 from jaxcal.io.sequence import FolderPixels, TrackedSequence
-from jaxcal.io.sources import ImportOptions, kind_of, read_rows, read_tracked, refuse
 from jaxcal.io.table import first_line
 from jaxcal.io.text import PoseTable, read_poses
 from jaxcal.runtime.array_types import Bool, Float

@@ -21,7 +21,7 @@ from jaxcal.runtime.array_types import Bool, Float, Int
 from jaxcal.runtime.messages import command_line
 
 if TYPE_CHECKING:
-    from jaxcal.io.sources import ImportOptions
+    from jaxcal.io.importing.sources import ImportOptions
 
 FATES = ("found", "not credible", "not tracked", "image not OK")
 FOUND, NOT_CREDIBLE, NOT_TRACKED, IMAGE_NOT_OK = range(4)
@@ -39,6 +39,7 @@ class FrameResults:
         covariance: (n, 2, 2), px^2; NaN where not found.
         contrast_db: (n,) the target's envelope over the background, dB; NaN where not measured.
         margin_db: (n,) the target's envelope over the next brightest place, dB; NaN likewise.
+        width: (n, 2) SDs of the target's spot along u and v, px; NaN where not found.
         files: names of the images of a folder; empty for a sequence.
     """
 
@@ -49,6 +50,7 @@ class FrameResults:
     covariance: Float[np.ndarray, "n 2 2"]
     contrast_db: Float[np.ndarray, " n"]
     margin_db: Float[np.ndarray, " n"]
+    width: Float[np.ndarray, "n 2"]
     files: tuple[str, ...] = ()
 
     def __len__(self) -> int:
@@ -104,6 +106,7 @@ def search_target(
     reason = [""] * count
     position, covariance = np.full((count, 2), np.nan), np.full((count, 2, 2), np.nan)
     contrast, margin = np.full(count, np.nan), np.full(count, np.nan)
+    width = np.full((count, 2), np.nan)
     rows = np.flatnonzero(fate == NOT_CREDIBLE)
     frames = sequence.images(rows, orientation=options.orientation)
     for row, frame in zip(rows, frames, strict=True):
@@ -114,5 +117,6 @@ def search_target(
         if located.found[0]:
             fate[row] = FOUND
             position[row], covariance[row] = located.position[0], located.covariance[0]
-    found = position, covariance, contrast, margin
+            width[row] = located.width[0]
+    found = position, covariance, contrast, margin, width
     return FrameResults(target, fate, tuple(reason), *found, sequence.files)

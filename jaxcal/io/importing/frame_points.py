@@ -11,10 +11,10 @@ import numpy as np
 from jaxcal import InputError
 from jaxcal.io.folder import first_repeated, rows_by_name
 from jaxcal.io.given_files import naming
-from jaxcal.io.poses_by_time import times_of_table
+from jaxcal.io.importing.poses_by_time import times_of_table
+from jaxcal.io.importing.sources import Assignment
 from jaxcal.io.sequence import TrackedSequence
 from jaxcal.io.slicer import pixels_from_markups, read_markups
-from jaxcal.io.sources import Assignment
 from jaxcal.io.text import PoseTable
 from jaxcal.runtime.array_types import Float, Int
 from jaxcal.runtime.messages import counted, quoted, seconds

@@ -1,0 +1,83 @@
+"""Tables with poses and points, and the pair of files of the public cross-wire recordings."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from jaxcal import InputError
+from jaxcal.io.importing.imported import Imported, good_time, naming_pose_units, pixel_size
+from jaxcal.io.importing.poses_by_time import PoseTrack
+from jaxcal.io.importing.sources import ImportOptions, kind_of, read_rows, refuse
+from jaxcal.io.importing.two_tables import one_of_two_tables
+from jaxcal.io.table import first_line, parse_numbers, read_table
+from jaxcal.io.text import PoseTable, read_crosswire, recording_of
+from jaxcal.runtime.array_types import Float
+
+
+def from_tables(sources: Sequence[str | os.PathLike[str]], options: ImportOptions) -> Imported:
+    """The recording of one table, of a table with poses and one with points, or of the pair."""
+    if options.poses is not None:
+        raise InputError("--poses goes with a sequence or a folder of PNG images")
+    kinds = [kind_of(source) for source in sources]
+    two = len(sources) == 2 and "markups" not in kinds
+    unused = "source", "target", "points", "target_kind", "region", "orientation"
+    refuse(options, unused, "does not go with a table of poses and points: it is for sequences")
+    options = replace(options, spacing_mm=pixel_size(None, options), spacing_from=None)
+    if two and _have_headers(sources):
+        tables = [read_rows(each, options, ignore_time=options.ignore_time) for each in sources]
+        return _from_table(*one_of_two_tables(*tables, lag_s=options.lag_s), options)
+    refuse(options, ("lag_s",), "is for poses that are matched to images by their times")
+    if two:
+        if options.units == "mm":
+            raise InputError("a pair of text files holds pixels: --units mm does not go with it")
+        unused = "quaternion", "skip_invalid", "ignore_time"
+        refuse(options, unused, "does not go with a pair of text files, poses and points")
+        with naming_pose_units(options):
+            pair = read_crosswire(
+                *sources,
+                spacing_mm=options.spacing_mm,
+                pose_units=options.pose_units or "mm",
+                invert_poses=options.invert_poses,
+                minimum=options.minimum,
+            )
+        return Imported(pair, [])
+    if len(sources) != 1 or kinds[0] != "table":
+        raise InputError(
+            f"{os.fspath(sources[0])}: holds no poses: a sequence, a tracker's export or a table "
+            "with poses is needed"
+        )
+    table = read_rows(sources[0], options, ignore_time=options.ignore_time)
+    return _from_table(table, table.notes, 0, options)
+
+
+def _have_headers(sources: Sequence[str | os.PathLike[str]]) -> bool:
+    """Whether two text files are tables with headers, and not the pair of rows R|t and u v."""
+    if not any(first_line(source)[1] for source in sources):
+        return False
+    first = parse_numbers(read_table(sources[0], header=False).rows[0])
+    return len(first) != 4 or None in first
+
+
+def _from_table(table: PoseTable, notes: list[str], lost: int, options: ImportOptions) -> Imported:
+    """The recording of a table with poses and points; ``lost`` further points have no pose."""
+    if table.time is None and options.ignore_time:
+        notes = [*notes, "time stamps are missing or cannot be read: not kept"]
+    if table.time is not None:
+        time, said = good_time(table.time, lambda row: f"{table.name}:{table.lines[row]}", options)
+        table, notes = replace(table, time=time), notes + said
+        if time is not None and table.velocity is None:
+            table = replace(table, velocity=_velocities(time, table))
+    with naming_pose_units(options, table.length_stated):
+        recording = recording_of(table, options.spacing_mm, options.minimum)
+    return Imported(recording, notes, most_lost=len(table) < lost)
+
+
+def _velocities(time: Float[np.ndarray, " n"], table: PoseTable) -> Float[np.ndarray, "n 6"] | None:
+    """How the probe moved, from the poses of neighbouring rows; None where they do not tell."""
+    if table.poses is None or len(time) < 2:
+        return None
+    return PoseTrack.of_table(time, table.poses, table.name).velocities(time)
