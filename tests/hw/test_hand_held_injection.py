@@ -171,8 +171,11 @@ class Person:
             self._keys.append("s")
         elif "Enter accepts" not in advice:
             follow(self.hand, advice)
-        elif now - self._pressed > 0.4:
+        elif self.hand.offset != self.hand.aim:
+            # On a busy computer what is shown is late: stop, and look again, as a person would.
             self.hand.go(self.hand.offset)
+            self._rests_until = now + 0.4
+        elif now - self._pressed > 0.4:
             self._pressed = now
             self._keys.append("enter")
 
