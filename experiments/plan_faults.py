@@ -12,10 +12,12 @@ Seed 20261123.
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 from common import arguments, machine, write_table
 from pose_design import MOUNT, POOL, errors, pool, taken
-from unmodelled import CURVE_MM, judged
+from unmodelled import CURVE_MM, judged, true_points
 
 import jaxcal
 from jaxcal import design
@@ -57,8 +59,9 @@ def main() -> None:
                     recordings.append(Recording(make_images(moved, measured)))
                 results = jaxcal.calibrate_batch(recordings).numpy()
                 fault = "curve" if curve_mm else "none"
+                truly = partial(true_points, size=np.ones(2), fault=fault)
                 told = np.mean([
-                    judged(results[k], recordings[k], MOUNT, np.ones(2), fault)
+                    judged(results[k], recordings[k], MOUNT, fault, truly)
                     for k in range(trials)
                 ], axis=0)  # fmt: skip
                 squared, _ = errors(

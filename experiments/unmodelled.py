@@ -34,6 +34,7 @@ Seed 20261123; trial k of a condition is fold_in(root, condition * 10^6 + k).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
 import jax
@@ -97,9 +98,35 @@ def seen_wrongly(key: Array, poses: Array) -> Array:
     return poses @ errors
 
 
+def wrong_poses(fault: str, key: Array, order: Array, poses: Array, x: Array) -> Array:
+    """Poses after a fault of the mount, the target or the tracker; ``order`` is of the images."""
+    images = len(poses)
+    if fault in ("slip", "step"):
+        part = SLIP_MM * jnp.linspace(-1.0, 0.0, images)
+        if fault == "step":
+            part = jnp.where(jnp.arange(images) < 3 * images // 4, -SLIP_MM, 0.0)
+        return poses.at[:, :3, 3].add(-part[:, None] * (poses[:, :3, :3] @ x[:3, 0]))
+    if fault == "targets":
+        # A pose moved by the distance between two targets shows the second one.
+        apart = jax.random.normal(jax.random.fold_in(key, 9), (3,))
+        apart = APART_MM * apart / jnp.linalg.norm(apart)
+        other = order < round(OTHER_SHARE * images)
+        return poses.at[:, :3, 3].add(other[:, None] * apart)
+    if fault == "displaced":
+        by = jax.random.normal(jax.random.fold_in(key, 11), (3,))
+        late = jnp.arange(images) >= 3 * images // 4
+        return poses.at[:, :3, 3].add(DISPLACED_MM * late[:, None] * by / jnp.linalg.norm(by))
+    if fault == "distortion":
+        moved = dipole(jax.random.fold_in(key, 8), poses[:, :3, 3])
+        return poses.at[:, :3, 3].add(moved)
+    if fault == "marker":
+        return seen_wrongly(jax.random.fold_in(key, 10), poses)
+    return poses
+
+
 @partial(jax.jit, static_argnums=(0, 1))
 def draw(images: int, fault: str, indices: Array):
-    """Problems of one condition, their true X, and the true distances of a measured mm."""
+    """Problems of one condition, their true X, and the true lengths of a measured mm."""
     protocol = jaxcal.Protocol(images=images, test_images=2, elevation_mm=1.0, noise_mm=1.0)
     root = jax.random.key(SEED)
 
@@ -119,30 +146,11 @@ def draw(images: int, fault: str, indices: Array):
             poses = poses.at[:, :3, 3].add(-BESIDE_MM * (poses[:, :3, :3] @ x[:3, 1]))
             squared = points[:, 1] ** 2 - y**2 + (y + BESIDE_MM) ** 2
             points = points.at[:, 1].set(jnp.sqrt(squared))
-        if fault in ("slip", "step"):
-            part = SLIP_MM * jnp.linspace(-1.0, 0.0, images)
-            if fault == "step":
-                part = jnp.where(jnp.arange(images) < 3 * images // 4, -SLIP_MM, 0.0)
-            poses = poses.at[:, :3, 3].add(-part[:, None] * (poses[:, :3, :3] @ x[:3, 0]))
         order = jax.random.permutation(jax.random.fold_in(key, 7), images)
+        poses = wrong_poses(fault, key, order, poses, x)
         if fault == "second echo":
             late = order < round(ECHO_SHARE * images)
             points = points.at[:, 1].add(ECHO_MM * late)
-        if fault == "targets":
-            # A pose moved by the distance between two targets shows the second one.
-            apart = jax.random.normal(jax.random.fold_in(key, 9), (3,))
-            apart = APART_MM * apart / jnp.linalg.norm(apart)
-            other = order < round(OTHER_SHARE * images)
-            poses = poses.at[:, :3, 3].add(other[:, None] * apart)
-        if fault == "displaced":
-            by = jax.random.normal(jax.random.fold_in(key, 11), (3,))
-            late = jnp.arange(images) >= 3 * images // 4
-            poses = poses.at[:, :3, 3].add(DISPLACED_MM * late[:, None] * by / jnp.linalg.norm(by))
-        if fault == "distortion":
-            moved = dipole(jax.random.fold_in(key, 8), poses[:, :3, 3])
-            poses = poses.at[:, :3, 3].add(moved)
-        if fault == "marker":
-            poses = seen_wrongly(jax.random.fold_in(key, 10), poses)
         if fault == "curve":
             points = points.at[:, 1].add(CURVE_MM * (points[:, 0] / SIDE_MM) ** 2)
         return poses, points, x, size
@@ -150,7 +158,23 @@ def draw(images: int, fault: str, indices: Array):
     return jax.vmap(one)(indices)
 
 
-def judged(result, recording: Recording, x: np.ndarray, size: np.ndarray, fault: str) -> list[bool]:
+def true_points(there: np.ndarray, size: np.ndarray, fault: str) -> np.ndarray:
+    """Where points of the image truly are, mm."""
+    true = there * [size[0], 1.0, size[1]]
+    if fault == "skew":
+        true[:, 0] -= SKEW * true[:, 2]
+    if fault == "curve":
+        true[:, 2] -= CURVE_MM * (true[:, 0] / SIDE_MM) ** 2
+    return true
+
+
+def judged(
+    result: jaxcal.Calibration,
+    recording: Recording,
+    x: np.ndarray,
+    fault: str,
+    truly: Callable[[np.ndarray], np.ndarray],
+) -> list[bool]:
     """What is told of, and what the verdict is worth, for one calibration."""
     record = calibration_record(result, recording)
     if record["wrong_frames"]:
@@ -165,11 +189,7 @@ def judged(result, recording: Recording, x: np.ndarray, size: np.ndarray, fault:
     right = groups or kind == "origins" if fault == "second echo" else kind == fault
     points = region_of(result, recording).grid()[:, [0, 2]]
     there = np.stack([points[:, 0], 0 * points[:, 0], points[:, 1]], axis=1)
-    true = there * [size[0], 1.0, size[1]]
-    if fault == "skew":
-        true[:, 0] -= SKEW * true[:, 2]
-    if fault == "curve":
-        true[:, 2] -= CURVE_MM * (true[:, 0] / SIDE_MM) ** 2
+    true = truly(there)
     found = np.asarray(result.image_to_probe)
     apart = there @ found[:3, :3].T + found[:3, 3] - true @ x[:3, :3].T - x[:3, 3]
     error = float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))
@@ -194,7 +214,13 @@ def main() -> None:
             recordings = [Recording(make_images(*each)) for each in zip(poses, points, strict=True)]
             estimate = "sound-speed" if fault in SPEED_ESTIMATED else ()
             results = jaxcal.calibrate_batch(recordings, estimate=estimate).numpy()
-            told = [judged(results[k], recordings[k], x[k], size[k], fault) for k in range(trials)]
+            told = [
+                judged(
+                    results[k], recordings[k], x[k], fault,
+                    partial(true_points, size=size[k], fault=fault),
+                )
+                for k in range(trials)
+            ]  # fmt: skip
             shares = np.mean(told, axis=0)
             rows.append([fault, images, trials, *map(float, shares)])
             print(*rows[-1], sep=", ", flush=True)

@@ -227,6 +227,16 @@ class ImageErrors:
         rows[..., 2, further:] = stretch[..., None] * self.rows[..., 1, further:]
         return rows
 
+    def channel_errors(self) -> Float[Array, "k n elements"]:
+        """Every element's distance error, prediction less measurement, mm; 0 if not heard."""
+        channels = self.problem.channels
+        assert channels is not None
+        far = np.linalg.norm(self.q[:, :, None] - np.asarray(channels.elements)[:, None], axis=-1)
+        predicted = model.predicted_distance(far, self.unknowns.along(2))
+        weight = self.mask[..., None] * np.nan_to_num(np.asarray(channels.heard))
+        measured = np.nan_to_num(np.asarray(channels.distances))
+        return np.where(weight > 0, predicted - measured, 0.0)
+
     def channel_rows(self) -> Float[Array, "k m p"]:
         """Derivatives of every element's distance error, mm; m is n times the number of elements.
 

@@ -38,7 +38,6 @@ import numpy as np
 
 from jaxcal.diagnostics.image_errors import KINDS, ImageErrors, Whitened, further_prior, quadratic
 from jaxcal.diagnostics.uncertainty import inverses, variances_by_axis
-from jaxcal.model.unknowns import predicted_distance
 from jaxcal.result.calibration import Calibration, check_one, data_of
 from jaxcal.runtime.array_types import Bool, Float, Int
 from jaxcal.runtime.arrays import batch_of_one
@@ -238,11 +237,8 @@ def _from_channels(answer: Calibration, seen: ImageErrors, used: Array) -> White
     rows = seen.channel_rows()[0]
     elements = np.asarray(channels.elements)[0]
     rows = rows.reshape(len(used), len(elements), -1)[used] / element_sd
-    far = np.linalg.norm(seen.q[0][used, None] - elements, axis=-1)
-    model = predicted_distance(far[None], seen.unknowns.along(2))[0]
     listened = np.nan_to_num(np.asarray(channels.heard))[0][used]
-    measured = np.nan_to_num(np.asarray(channels.distances))[0][used]
-    errors = np.where(listened > 0, model - measured, 0.0) / element_sd
+    errors = seen.channel_errors()[0][used] / element_sd
     offset = seen.errors[0][used, 2:] / sigma[2]
     errors = np.concatenate([errors, offset], axis=1)
     rows = np.concatenate([rows, seen.rows[0][used, 2:] / sigma[2]], axis=1)

@@ -1,6 +1,6 @@
 """Would an error that the model leaves out explain the residuals better?
 
-Nine are looked for with a few parameters theta, linearised at the answer:
+Ten are looked for with a few parameters theta, linearised at the answer:
 
     scale   the pixels' sizes or the sound speed: x and r are too long by a share of themselves
     lateral the same of x alone, where the sound speed is estimated: a wrong width of the pixels, or
@@ -17,6 +17,8 @@ Nine are looked for with a few parameters theta, linearised at the answer:
     lag     images show what was earlier than their poses, of a probe in motion; where the probe's
             velocities are known. Offsets do not count here either: a hand that moves the target
             towards the image plane may stop too early every time
+    speed   the sound speed, where every element's time of flight is fitted: all distances are too
+            long by a share of themselves
     beside  the target lies beside the image plane by m in all images, so ranges are too long by
             m^2 / (2 r), which hardly any other error imitates; theta = m^2
 
@@ -30,19 +32,22 @@ of equal size exceed 22 once in a thousand recordings, and errors that grow with
 as they exceed the limit of a slip. An answer within bounds is first moved to the optimum of
 Gaussian offsets.
 
-A tenth, a distortion of the tracked positions, has a random field instead of few parameters
+An eleventh, a distortion of the tracked positions, has a random field instead of few parameters
 (:mod:`jaxcal.diagnostics.tracker_distortion`). Its limit is from simulations with errors that grow
 with depth as well. Half of it must be exceeded without any neighbourhood, too: a few neighbours
 with an error in common imitate a distortion. And without the elevational errors: offsets that
 change slowly along a path move the answer, and then errors in the plane change with the pose. The
 same holds for a step.
-An eleventh, markers that are wrong from some sides, has a random field of the orientations and the
-same limits. A twelfth, a second target or a second origin of the images
+A twelfth, markers that are wrong from some sides, has a random field of the orientations and the
+same limits. A thirteenth, a second target or a second origin of the images
 (:mod:`jaxcal.diagnostics.second_target`), has a parameter for each image, which says which of the
 two it has. It goes first if it is the clearest in spite of the n ln 2 that these choices cost.
 
-All but the twelfth must exceed their limits also if errors are alike in successive images, as far
-as what is left of them shows it (:mod:`jaxcal.diagnostics.serial_errors`).
+All but the thirteenth must exceed their limits also if errors are alike in successive images, as
+far as what is left of them shows it (:mod:`jaxcal.diagnostics.serial_errors`).
+
+Where times of flight are fitted, the points that they say are looked at
+(:mod:`jaxcal.diagnostics.channel_points`).
 
 References: Wilks 1938; Andrews 1993 (a change at an unknown place).
 """
@@ -55,7 +60,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxcal.data.problem import Problem
 from jaxcal.diagnostics import tracker_distortion
+from jaxcal.diagnostics.channel_points import as_points, excess_of_points
 from jaxcal.diagnostics.gaussian_offsets import GaussianOffsets, in_sds, shortened, tuned
 from jaxcal.diagnostics.image_errors import ImageErrors
 from jaxcal.diagnostics.second_target import FEWEST as FEWEST_OF_TWO
@@ -77,7 +84,7 @@ other errors are imitated by chance (of 300 clean conventional fits of 12 images
 reported)."""
 
 _OF_POINTS = ("scale", "lateral", "skew", "curve")
-"""Errors of the measured points (:func:`_excess`); the others are of the poses or the target."""
+"""Errors of the measured points (:func:`_excess`); not looked for in times of flight."""
 _BY_CHANCE = {
     "scale": 13.8,
     "lateral": 10.8,
@@ -87,6 +94,7 @@ _BY_CHANCE = {
     "displaced": 26.0,
     "skew": 10.8,
     "curve": 10.8,
+    "speed": 10.8,
     "beside": 9.5,
     "distortion": 12.0,
     "marker": 12.0,
@@ -135,19 +143,24 @@ class Unmodelled:
     images: tuple[int, ...] = ()
 
     def moved(
-        self, points: Float[Array, "m 2"], jacobian: Float[Array, "m 3 p"], face_mm: float
+        self, points: Float[Array, "m 2"], jacobian: Float[Array, "m 3 p"], problem: Problem
     ) -> tuple[float, float]:
         """Root mean square motion of image points, mm: if it is corrected, and of a slip.
 
         Args:
             points: [lateral, axial], mm.
             jacobian: their derivatives by the unknowns.
-            face_mm: range of pixel row 0.
+            problem: of the calibration.
         """
         by = jacobian @ self.step
         if self.kind in _OF_POINTS:
             lateral, axial = points.T
-            by -= (_excess(self.kind, lateral, axial, face_mm) @ self.values)[:, [0, 2, 1]]
+            face = float(np.asarray(problem.face_offset))
+            by -= (_excess(self.kind, lateral, axial, face) @ self.values)[:, [0, 2, 1]]
+        if self.kind == "speed":
+            assert problem.channels is not None
+            excess = excess_of_points(points, np.asarray(problem.channels.elements))
+            by[:, [0, 2]] -= self.values * excess
         if self.kind == "beside":
             by[:, 1] += self.values[0]
         slip = np.zeros_like(by)
@@ -164,22 +177,26 @@ def unmodelled(
 ) -> list[Unmodelled]:
     """What the residuals of one calibration with concrete values show, the clearest first.
 
-    Only fits of points are looked at; ``velocity`` is that of a recording's images.
+    Times of flight are looked at as the points that all elements of an image say; ``velocity`` is
+    that of a recording's images.
     """
-    used = np.asarray(calibration.mask) > 0
-    points = calibration.data == "points"
-    if calibration.problem is None or not points or used.sum() < FEWEST:
+    if calibration.problem is None or np.sum(np.asarray(calibration.mask) > 0) < FEWEST:
         return []
-    conventional = calibration.method == "conventional"
-    few = used.sum() < (_FEWEST_CONVENTIONAL if conventional else _FEWEST_OF_ALL)
-    answer = batch_of_one(calibration.numpy())
-    if calibration.prior in TUNED:
+    answer, speed = batch_of_one(calibration.numpy()), None
+    if calibration.data == "channels":
+        answer, seen, speed = as_points(answer)
+    elif calibration.prior in TUNED:
         seen = ImageErrors.of_answer(answer).centred(answer)
     else:
         # Offsets that are free within a bound absorb much of an error, above all a step; and
         # the conventional fit, which has none, weighs them like the other errors.
         seen = GaussianOffsets.of(answer).seen
-    candidates = _candidates(seen, used)
+    used = seen.mask[0] > 0
+    if used.sum() < FEWEST:
+        return []
+    conventional = calibration.method == "conventional"
+    few = used.sum() < (_FEWEST_CONVENTIONAL if conventional else _FEWEST_OF_ALL)
+    candidates = _candidates(seen, used, speed)
     with np.errstate(all="ignore"):
         if few:
             return _explained(answer, seen, used, [e for e in candidates if e.kind == "beside"])
@@ -251,8 +268,17 @@ def _explained(
     return found
 
 
-def _candidates(seen: ImageErrors, used: Bool[Array, " n"]) -> list[Candidate]:
-    """All that can be looked for without velocities or a place, in mm."""
+def _candidates(
+    seen: ImageErrors, used: Bool[Array, " n"], speed: Float[Array, "n 2"] | None
+) -> list[Candidate]:
+    """All that can be looked for without velocities or a place, in mm.
+
+    Args:
+        seen: the errors.
+        used: the images that count.
+        speed: by how much points are off if all distances of their elements are too long by their
+            own size; None for calibrations from points.
+    """
     distance = seen.distance[0]
     face = float(np.asarray(seen.problem.face_offset)[0])
     zero = np.zeros_like(distance)
@@ -262,9 +288,15 @@ def _candidates(seen: ImageErrors, used: Bool[Array, " n"]) -> list[Candidate]:
         Candidate("slip", order[:, None, None] * within),
         Candidate("beside", np.stack([zero, 0.5 / distance, zero], axis=-1)[..., None]),
     ]
-    # An estimated sound speed is the scale of the ranges, so that only the other one can be wrong.
-    lengths = {"lateral"} if "sound-speed" in seen.blocks else {"scale"}
-    looked_for = {"skew", "curve"} | (set() if "scale" in seen.blocks else lengths)
+    if speed is not None:
+        looked_for: set[str] = set()
+        if "sound-speed" not in seen.blocks:
+            found.append(Candidate("speed", np.stack([*speed.T, zero], axis=-1)[..., None]))
+    else:
+        # An estimated sound speed is the scale of the ranges, so that only the other one can be
+        # wrong.
+        lengths = {"lateral"} if "sound-speed" in seen.blocks else {"scale"}
+        looked_for = {"skew", "curve"} | (set() if "scale" in seen.blocks else lengths)
     for kind in _OF_POINTS:
         if kind in looked_for:
             # A measurement without its excess is smaller; the prediction less it is larger.

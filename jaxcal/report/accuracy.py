@@ -222,7 +222,7 @@ def _unmodelled(
     first, problem = found[0], answer.problem
     assert problem is not None
     jacobian = np.asarray(image_jacobian(answer, grid))
-    moved, slip = first.moved(grid, jacobian, float(np.asarray(problem.face_offset)))
+    moved, slip = first.moved(grid, jacobian, problem)
     return {
         "kind": first.kind,
         "values": first.values,

@@ -238,6 +238,11 @@ def _explanation(found: dict[str, Any], *, pixels: bool) -> tuple[str, str]:
                 "of the middle",
                 "a curved array taken for a straight one, or the delays of another probe?",
             )
+        case "speed":
+            return (
+                f"distances that are {_too_long(values[0])}",
+                "is it the sound speed of this water? Estimate it (--estimate sound-speed)",
+            )
         case "beside":
             return (
                 f"a target {values[0]:.1f} mm beside the image plane in all images",
