@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.optimize
 from conftest import angle
 
 import jaxcal
 from jaxcal import InputError, Protocol
 from jaxcal.cli.main import main
 from jaxcal.data.probe import CurvilinearProbe, LinearProbe
+from jaxcal.diagnostics.channel_points import as_points
+from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns
 from jaxcal.io.hdf5 import save
+from jaxcal.runtime.arrays import batch_of_one
 
 CURVED = CurvilinearProbe(elements=32, pitch_mm=2.0, radius_mm=60.0)
 STRAIGHT = LinearProbe(elements=32, pitch_mm=1.8)
@@ -158,6 +163,67 @@ def test_a_prior_sd_without_effect_is_refused(method, request_parts):
     points = replace(jaxcal.Problem.from_recording(recording(STRAIGHT)), channels=None)
     with pytest.raises(InputError, match=r"_sd is the prior SD of an estimated .*: it needs"):
         jaxcal.calibrate(points, method, **request_parts)
+
+
+@pytest.mark.parametrize("probe", [STRAIGHT, CURVED], ids=["straight", "curved"])
+def test_elements_say_what_a_point_fitted_to_them_says(probe):
+    """Of the errors, of their derivatives, and of distances that are all too long."""
+    problem = jaxcal.Problem.from_recording(recording(probe))
+    channels, elements = problem.channels, probe.element_positions()
+    assert channels is not None
+    answer = batch_of_one(jaxcal.calibrate(problem, prior="gaussian", data="channels").numpy())
+    _, seen, speed = as_points(answer)
+
+    def fitted(distances: np.ndarray, offset: float) -> np.ndarray:
+        """Lateral position and range of the point with that offset."""
+
+        def left(point: np.ndarray) -> np.ndarray:
+            x, axial = point[0], np.sqrt(point[1] ** 2 - offset**2)
+            return np.linalg.norm([x, offset, axial] - elements, axis=1) - distances
+
+        return scipy.optimize.least_squares(left, [0.0, 60.0], xtol=1e-14, ftol=1e-14).x
+
+    for row in (0, 7, 19):
+        q = seen.q[0, row]
+        predicted = np.array([q[0], np.hypot(q[1], q[2])])
+        measured = np.asarray(channels.distances)[row]
+        truly = np.linalg.norm(q - elements, axis=1)
+        expected = predicted - fitted(measured, q[1])
+        # The fit is not linear; errors are 0.1 mm.
+        np.testing.assert_allclose(seen.errors[0, row, :2], expected, atol=2e-4)
+        longer = (fitted(truly * (1 + 1e-6), q[1]) - predicted) / 1e-6
+        np.testing.assert_allclose(speed[row], longer, rtol=1e-4, atol=1e-3)
+        for unknown in range(9):
+            moved = answer.problem, 1e-5 * np.eye(9)[unknown][None]
+            there = Unknowns.of(answer).moved(moved[1], answer.blocks)
+            other = ImageErrors.of(there, moved[0], answer.blocks).q[0, row]
+            off = np.linalg.norm(other - elements, axis=1)
+            by = fitted(off, q[1]) - predicted
+            np.testing.assert_allclose(
+                seen.rows[0, row, :2, unknown], by / 1e-5, rtol=1e-3, atol=1e-3
+            )
+
+
+def test_errors_that_the_model_leaves_out_are_named_from_times_of_flight():
+    data = recording(CURVED, noise=0.3)
+    assert data.truth is not None
+    images, x = data.calibration, data.truth.image_to_probe
+    too_long = replace(images, measurements=1.03 * images.measurements)
+    poses = images.poses.copy()
+    poses[13:, :3, 3] -= 3.0 * (poses[13:] @ x)[:, :3, 0]
+    slipped = replace(images, poses=poses)
+    for changed, told in (
+        (images, None),
+        (
+            too_long,
+            r"distances that are too long by 3\.\d % would .*: is it the sound speed of this",
+        ),
+        (slipped, r"an image that moves by [23]\.\d mm on the probe near image 1[234] "),
+    ):
+        there = replace(data, calibration=changed)
+        verdict = "\n".join(jaxcal.calibrate(there, prior="gaussian").verdict())
+        assert ("would explain" in verdict) == (told is not None)
+        assert told is None or re.search(told, verdict), verdict
 
 
 def test_missing_and_late_lines_do_no_harm():

@@ -82,22 +82,22 @@ def excess_of_points(
     """
     q = np.insert(points, 1, 0.0, axis=1)[None]
     far = np.linalg.norm(q[:, :, None] - elements, axis=-1)
-    to_point, _ = _to_point(q, elements, np.ones_like(far))
+    to_point, _ = _to_point(q, elements[None, None], np.ones_like(far))
     return (to_point @ far[..., None])[0, ..., 0]
 
 
 def _to_point(
-    q: Float[Array, "k n 3"], elements: Float[Array, "*#k #n e 3"], heard: Float[Array, "k n e"]
+    q: Float[Array, "k n 3"], elements: Float[Array, "#k #n e 3"], heard: Float[Array, "k n e"]
 ) -> tuple[Float[Array, "k n 2 e"], Float[Array, "k n 2 2"]]:
     """(G' G)^-1 G' and (G' G)^-1; zeros where the elements do not determine a point."""
     apart = q[:, :, None] - elements
     far = np.linalg.norm(apart, axis=-1)
     # Along the image's axial direction z moves by r / z if the range r moves by 1.
-    stretch = np.hypot(q[..., 1], q[..., 2]) / q[..., 2]
+    in_front = (q[..., 2] > 0)[..., None]
+    stretch = np.hypot(q[..., 1], q[..., 2]) / np.where(q[..., 2] > 0, q[..., 2], 1.0)
     g = np.stack([apart[..., 0], apart[..., 2] * stretch[..., None]], axis=-1)
-    g = g * (heard / far)[..., None]
+    g = g * (in_front * heard / np.where(far > 0, far, 1.0))[..., None]
     normal = np.swapaxes(g, -1, -2) @ g
-    known = np.linalg.det(normal) > _LEAST_DETERMINANT
-    inverse = np.linalg.inv(np.where(known[..., None, None], normal, np.eye(2)))
-    inverse = inverse * known[..., None, None]
+    known = (np.linalg.det(normal) > _LEAST_DETERMINANT)[..., None, None]
+    inverse = np.linalg.inv(np.where(known, normal, np.eye(2))) * known
     return inverse @ np.swapaxes(g, -1, -2), inverse
