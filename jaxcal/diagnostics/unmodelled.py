@@ -49,7 +49,7 @@ far as what is left of them shows it (:mod:`jaxcal.diagnostics.serial_errors`).
 Where times of flight are fitted, the points that they say are looked at
 (:mod:`jaxcal.diagnostics.channel_points`).
 
-References: Wilks 1938; Andrews 1993 (a change at an unknown place).
+Reference: Wilks 1938.
 """
 
 from __future__ import annotations
@@ -62,6 +62,7 @@ import numpy as np
 
 from jaxcal.data.problem import Problem
 from jaxcal.diagnostics import tracker_distortion
+from jaxcal.diagnostics.change_point import change_point
 from jaxcal.diagnostics.channel_points import as_points, excess_of_points
 from jaxcal.diagnostics.gaussian_offsets import GaussianOffsets, in_sds, shortened, tuned
 from jaxcal.diagnostics.image_errors import ImageErrors
@@ -106,9 +107,6 @@ _AT_ONCE = ("step", "displaced")
 """Errors that begin with one image; where is looked for."""
 _PLACES = 16
 """As so many places that are independent of one another count all at which a step may be."""
-_FEWEST_EACH_SIDE, _LEAST_SHARE = 3, 0.1
-"""Least number of images before and after a step, and their least share: a few successive images of
-a stream have errors in common."""
 SIDE_MM = 20.0
 """The lateral position at which a curve is stated."""
 
@@ -316,42 +314,10 @@ def _steps(answer: Calibration, seen: ImageErrors, used: Bool[Array, " n"]) -> l
         errors, rows = _in_sds(answer, seen, used, [columns])
         known, own = np.split(rows, [-columns.shape[-1]], axis=-1)
         before, _ = tuned(*shortened(errors, known), len(images))
-        place = images[_clearest_place(errors, known, own, before)]
+        place = images[change_point(errors, known, own, before)]
         after = np.where(np.arange(len(used)) < place, -0.5, 0.5) * used
         found.append(Candidate(kind, after[:, None, None] * columns, int(place)))
     return found
-
-
-def _clearest_place(
-    errors: Float[Array, "m 3"],
-    known: Float[Array, "m 3 p"],
-    own: Float[Array, "m 3 k"],
-    variance: Float[Array, " 3"],
-) -> int:
-    """After how many of the images a step by ``own`` lowers the sum of squares most.
-
-    The SDs stay as they are.
-    """
-    weight = 1 / np.sqrt(variance)
-    errors, own = errors * weight, own * weight[:, None]
-    scale = np.sqrt(np.maximum(np.sum(known**2, axis=(0, 1)), 1e-300))
-    basis = np.linalg.qr((known / scale * weight[:, None]).reshape(-1, len(scale)))[0]
-    rest = errors.ravel() - basis @ (basis.T @ errors.ravel())
-
-    first = max(_FEWEST_EACH_SIDE, math.ceil(_LEAST_SHARE * len(errors)))
-    places = np.arange(first, len(errors) - first + 1)
-
-    def step(of_images: Array) -> Array:
-        """Half the sum over the images after each place, less half of that before it."""
-        return 0.5 * of_images.sum(axis=0) - np.cumsum(of_images, axis=0)[places - 1]
-
-    # For every place at once: what the step and the unknowns have in common, and the errors.
-    common = step(np.einsum("mik,mip->mkp", own, basis.reshape(*errors.shape, -1)))
-    gradient = step(np.einsum("mik,mi->mk", own, rest.reshape(errors.shape)))
-    normal = 0.25 * np.einsum("mik,mil->kl", own, own) - common @ np.swapaxes(common, 1, 2)
-    inverse = np.linalg.pinv(normal, rcond=1e-9, hermitian=True)
-    gains = np.einsum("sk,skl,sl->s", gradient, inverse, gradient)
-    return int(places[np.argmax(gains)])
 
 
 def _lag(
