@@ -80,7 +80,8 @@ def recording_of(problem: jaxcal.Problem, probe: CurvilinearProbe | LinearProbe)
     assert problem.channels is not None
     heard = np.where(problem.channels.heard > 0, problem.channels.distances, np.nan)
     times = probe.time_of_flight_s(heard)
-    images = make_images(problem.poses, problem.measurements, time_of_flight=times)
+    poses, points = np.asarray(problem.poses), np.asarray(problem.measurements)
+    images = make_images(poses, points, time_of_flight=times)
     return Recording(images, probe=probe)
 
 

@@ -8,7 +8,8 @@ that fits them is off by
 
 to first order, and its covariance is (G' G)^-1 times the variance of one distance. So what is
 looked for in errors of points (:mod:`jaxcal.diagnostics.unmodelled`) can be looked for in times of
-flight.
+flight. An estimated sound speed or delay is taken for known: the times within each image determine
+it far better than the points do.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from dataclasses import replace
 import numpy as np
 
 from jaxcal.diagnostics.image_errors import ImageErrors
+from jaxcal.model.unknowns import RIGID, RIGID_UNKNOWNS
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Float
 
@@ -35,7 +37,8 @@ def as_points(answer: Calibration) -> tuple[Calibration, ImageErrors, Float[Arra
 
     Returns:
         The answer, whose problem has points with covariances of their own (of distances with an
-        SD of 1 mm) and whose mask is 0 where the elements do not determine a point; the errors;
+        SD of 1 mm), whose mask is 0 where the elements do not determine a point, and whose unknowns
+        are X and the target; the errors;
         and by how much the points are off, [lateral, range], if all distances are too long by their
         own size.
     """
@@ -59,14 +62,17 @@ def as_points(answer: Calibration) -> tuple[Calibration, ImageErrors, Float[Arra
         lateral=seen.lateral + off[..., 0],
         distance=seen.distance + off[..., 1],
         errors=errors * known[..., None],
-        rows=rows * known[..., None, None],
+        rows=rows[..., :RIGID_UNKNOWNS] * known[..., None, None],
         mask=known,
+        blocks=RIGID,
         problem=replace(answer.problem, covariance=covariance, mask=known),
     )
     law = answer.offset_law
     if law is not None:
         law = replace(law, own_probability=np.ones_like(np.asarray(law.own_probability)))
-    as_answer = replace(answer, data="points", problem=points.problem, mask=known, offset_law=law)
+    as_answer = replace(
+        answer, data="points", problem=points.problem, mask=known, offset_law=law, blocks=RIGID
+    )
     far = np.linalg.norm(seen.q[:, :, None] - elements, axis=-1)
     return as_answer, points, (to_point @ far[..., None])[0, ..., 0]
 

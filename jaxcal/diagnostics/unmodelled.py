@@ -127,8 +127,9 @@ class Unmodelled:
             two targets in mm; by how much the points of ``images`` are off laterally and axially,
             mm.
         statistic: 2 ln LR.
-        step: by how much the unknowns would change if it were corrected; of a distortion or a
-            marker, by one SD of each of its coefficients.
+        step: by how much the unknowns would change if it were corrected (from times of flight: X
+            and the target alone); of a distortion or a marker, by one SD of each of its
+            coefficients.
         image: the first one after a step of X or the target, or None.
         images: those of the second target or the second origin.
     """
@@ -150,7 +151,7 @@ class Unmodelled:
             jacobian: their derivatives by the unknowns.
             problem: of the calibration.
         """
-        by = jacobian @ self.step
+        by = jacobian[..., : len(self.step)] @ self.step
         if self.kind in _OF_POINTS:
             lateral, axial = points.T
             face = float(np.asarray(problem.face_offset))
@@ -183,6 +184,8 @@ def unmodelled(
     answer, speed = batch_of_one(calibration.numpy()), None
     if calibration.data == "channels":
         answer, seen, speed = as_points(answer)
+        if "sound-speed" in calibration.blocks:
+            speed = np.zeros_like(speed)
     elif calibration.prior in TUNED:
         seen = ImageErrors.of_answer(answer).centred(answer)
     else:
@@ -275,7 +278,7 @@ def _candidates(
         seen: the errors.
         used: the images that count.
         speed: by how much points are off if all distances of their elements are too long by their
-            own size; None for calibrations from points.
+            own size; zeros where the sound speed is estimated, None for calibrations from points.
     """
     distance = seen.distance[0]
     face = float(np.asarray(seen.problem.face_offset)[0])
@@ -288,7 +291,7 @@ def _candidates(
     ]
     if speed is not None:
         looked_for: set[str] = set()
-        if "sound-speed" not in seen.blocks:
+        if speed.any():
             found.append(Candidate("speed", np.stack([*speed.T, zero], axis=-1)[..., None]))
     else:
         # An estimated sound speed is the scale of the ranges, so that only the other one can be
