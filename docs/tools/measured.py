@@ -68,6 +68,8 @@ SETTINGS: dict[str, tuple[str, ...]] = {
         "250 clean recordings for each of three distributions and 30, 54 and 200 images",
         "1000 clean recordings each of 12, 30 and 60 images, and 200 each with one of twelve "
         "faults",
+        "distances with an SD of 0.5 mm",
+        "500 clean recordings each, and 100 with each fault",
         "at about 40 mm/s, 30 poses a second; 300 recordings without a lag and 60 with each lag, "
         "of 20 images, one a second, of 40, one every 0.9 s, and of 100, one every 0.2 s",
         "A lag of 20 ms is named",
