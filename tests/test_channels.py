@@ -19,6 +19,7 @@ from jaxcal.cli.main import main
 from jaxcal.data.probe import CurvilinearProbe, LinearProbe
 from jaxcal.diagnostics.channel_points import as_points
 from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns
+from jaxcal.diagnostics.unmodelled import unmodelled
 from jaxcal.io.hdf5 import save
 from jaxcal.runtime.arrays import batch_of_one
 
@@ -224,6 +225,25 @@ def test_errors_that_the_model_leaves_out_are_named_from_times_of_flight():
         verdict = "\n".join(jaxcal.calibrate(there, prior="gaussian").verdict())
         assert ("would explain" in verdict) == (told is not None)
         assert told is None or re.search(told, verdict), verdict
+
+
+@pytest.mark.parametrize("kind", ["points", "channels"])
+def test_an_image_that_the_answer_left_out_explains_nothing(kind):
+    data = recording(CURVED, noise=0.3)
+    problem = jaxcal.Problem.from_recording(data)
+    poses = np.array(problem.poses)
+    poses[13:, 0, 3] += 3.0
+    answer = jaxcal.calibrate(replace(problem, poses=poses), prior="gaussian", data=kind).numpy()
+    assert answer.problem is not None
+    wild = np.array(answer.problem.poses)
+    wild[4, :3, 3] += 50.0
+    mask = np.arange(20) != 4
+    left_out = replace(answer, mask=mask * answer.mask, problem=replace(answer.problem, poses=wild))
+    assert left_out.problem is not None
+    missing = replace(left_out, problem=replace(left_out.problem, mask=mask * answer.mask))
+    found, expected = unmodelled(left_out), unmodelled(missing)
+    assert found[0].kind == expected[0].kind == "displaced"
+    assert found[0].statistic == pytest.approx(expected[0].statistic, rel=1e-9)
 
 
 def test_missing_and_late_lines_do_no_harm():

@@ -49,7 +49,7 @@ def as_points(answer: Calibration) -> tuple[Calibration, ImageErrors, Float[Arra
     elements = np.asarray(channels.elements)[:, None]
     heard = seen.mask[..., None] * np.nan_to_num(np.asarray(channels.heard))
     to_point, covariance = _to_point(seen.q, elements, heard)
-    known = seen.mask * (np.linalg.det(covariance) > 0)
+    known = np.asarray(answer.mask) * seen.mask * (np.linalg.det(covariance) > 0)
 
     errors, rows = seen.errors.copy(), seen.rows.copy()
     by_element = seen.channel_rows().reshape(*heard.shape, -1)

@@ -192,7 +192,7 @@ def unmodelled(
         # Offsets that are free within a bound absorb much of an error, above all a step; and
         # the conventional fit, which has none, weighs them like the other errors.
         seen = GaussianOffsets.of(answer).seen
-    used = seen.mask[0] > 0
+    used = np.asarray(answer.mask)[0] > 0
     if used.sum() < FEWEST:
         return []
     conventional = calibration.method == "conventional"
