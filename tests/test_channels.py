@@ -173,6 +173,8 @@ def test_elements_say_what_a_point_fitted_to_them_says(probe):
     channels, elements = problem.channels, probe.element_positions()
     assert channels is not None
     answer = batch_of_one(jaxcal.calibrate(problem, prior="gaussian", data="channels").numpy())
+    assert answer.problem is not None
+    problem = answer.problem
     _, seen, speed = as_points(answer)
 
     def fitted(distances: np.ndarray, offset: float) -> np.ndarray:
@@ -195,9 +197,8 @@ def test_elements_say_what_a_point_fitted_to_them_says(probe):
         longer = (fitted(truly * (1 + 1e-6), q[1]) - predicted) / 1e-6
         np.testing.assert_allclose(speed[row], longer, rtol=1e-4, atol=1e-3)
         for unknown in range(9):
-            moved = answer.problem, 1e-5 * np.eye(9)[unknown][None]
-            there = Unknowns.of(answer).moved(moved[1], answer.blocks)
-            other = ImageErrors.of(there, moved[0], answer.blocks).q[0, row]
+            there = Unknowns.of(answer).moved(1e-5 * np.eye(9)[[unknown]], answer.blocks)
+            other = ImageErrors.of(there, problem, answer.blocks).q[0, row]
             off = np.linalg.norm(other - elements, axis=1)
             by = fitted(off, q[1]) - predicted
             np.testing.assert_allclose(

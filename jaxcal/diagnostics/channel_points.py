@@ -38,9 +38,8 @@ def as_points(answer: Calibration) -> tuple[Calibration, ImageErrors, Float[Arra
     Returns:
         The answer, whose problem has points with covariances of their own (of distances with an
         SD of 1 mm), whose mask is 0 where the elements do not determine a point, and whose unknowns
-        are X and the target; the errors;
-        and by how much the points are off, [lateral, range], if all distances are too long by their
-        own size.
+        are X and the target; the errors, mm; and by how much the points are off, [lateral, range],
+        mm, if all distances are too long by their own size.
     """
     assert answer.problem is not None
     channels = answer.problem.channels
@@ -84,7 +83,10 @@ def excess_of_points(
 
     Args:
         points: [lateral, axial] in the image plane, mm.
-        elements: of the array, mm.
+        elements: [lateral, elevational, axial] of the array's elements, image frame, mm.
+
+    Returns:
+        [lateral, range], mm; zeros where the elements do not determine a point.
     """
     q = np.insert(points, 1, 0.0, axis=1)[None]
     far = np.linalg.norm(q[:, :, None] - elements, axis=-1)

@@ -117,15 +117,15 @@ class Unmodelled:
 
     Attributes:
         kind: ``scale``, ``lateral``, ``slip``, ``step``, ``displaced``, ``skew``, ``curve``,
-            ``lag``, ``beside``, ``distortion``, ``marker``, ``targets`` or ``origins``.
+            ``lag``, ``speed``, ``beside``, ``distortion``, ``marker``, ``targets`` or ``origins``.
         values: its parameters: by which shares lateral positions and ranges are too long; by which
             lateral positions alone; motion of X from the first image to the last (lateral and
             axial, mm; about y, rad); motion of the target in the tracker's frame, mm; by which
             share of the depth lateral positions are too large; by how many mm ranges are too long
-            20 mm to the side; the lag of images behind poses in s; the distance m in mm; the root
-            mean square distortion, or motion of the image on the probe, in mm; the distance between
-            two targets in mm; by how much the points of ``images`` are off laterally and axially,
-            mm.
+            20 mm to the side; the lag of images behind poses in s; by which share all distances are
+            too long; the distance m in mm; the root mean square distortion, or motion of the image
+            on the probe, in mm; the distance between two targets in mm; by how much the points of
+            ``images`` are off laterally and axially, mm.
         statistic: 2 ln LR.
         step: by how much the unknowns would change if it were corrected (from times of flight: X
             and the target alone); of a distortion or a marker, by one SD of each of its
