@@ -25,6 +25,11 @@ def axial_on_circle(
     return xp.sqrt(xp.maximum(distance**2 - y**2, (1e-6 * distance) ** 2))
 
 
+def arc_limit(bound: Any, distance: Float[Any, "*batch n"]) -> Float[Any, "*batch n"]:
+    """The largest |y| on the arc, mm: the bound, but never the whole range r (mm)."""
+    return array_module(bound, distance).minimum(bound, LARGEST_ELEVATION * abs(distance))
+
+
 class OnArc(NamedTuple):
     """Every image's point p(y).
 
@@ -62,6 +67,6 @@ class OnArc(NamedTuple):
         axial = axial_on_circle(distance, y)
         slope = y / axial
         force = slope * (target[1] - axial) - (target[0] - y)
-        limit = xp.minimum(bound, LARGEST_ELEVATION * xp.abs(distance))
+        limit = arc_limit(bound, distance)
         resting = (xp.abs(y) >= (1 - AT_BOUND) * limit) & (xp.sign(y) * force <= 0)
         return cls(axial, slope, force, limit, resting)

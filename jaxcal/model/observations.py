@@ -37,8 +37,8 @@ from jaxtyping import Array, Bool, Float
 
 from jaxcal import InputError
 from jaxcal.data.problem import Problem
+from jaxcal.model.arc import arc_limit
 from jaxcal.model.batch import ImagePlanes, Iterate, check_batch, pad_images, targets
-from jaxcal.model.thresholds import LARGEST_ELEVATION
 from jaxcal.model.unknowns import (
     FURTHER,
     TABLE,
@@ -504,7 +504,7 @@ class BoundedOffsets(LocalUnknown):
 
     def limit(self, further: FurtherUnknowns, images: ImagePlanes) -> Array:
         """The largest |y_i|, mm."""
-        return jnp.minimum(self.bound, LARGEST_ELEVATION * jnp.abs(further.points(images)[1]))
+        return arc_limit(self.bound, further.points(images)[1])
 
     def local(
         self, q: Vector, further: FurtherUnknowns, images: ImagePlanes
