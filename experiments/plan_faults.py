@@ -17,7 +17,7 @@ from functools import partial
 import numpy as np
 from common import arguments, machine, write_table
 from pose_design import MOUNT, POOL, errors, pool, taken
-from unmodelled import CURVE_MM, judged, true_points
+from unmodelled import CURVE_MM, Judged, judged, true_points
 
 import jaxcal
 from jaxcal import design
@@ -60,17 +60,17 @@ def main() -> None:
                 results = jaxcal.calibrate_batch(recordings).numpy()
                 fault = "curve" if curve_mm else "none"
                 truly = partial(true_points, size=np.ones(2), fault=fault)
-                told = np.mean([
+                told = Judged.shares([
                     judged(results[k], recordings[k], MOUNT, fault, truly)
                     for k in range(trials)
-                ], axis=0)  # fmt: skip
+                ])  # fmt: skip
                 squared, _ = errors(
                     np.asarray(results.image_to_probe), candidates.poses[:2], points
                 )
                 name = "random" if share is None else "planned"
                 rows.append([
                     images, name, "" if share is None else share, trials, curve_mm,
-                    float(np.sqrt(squared.mean())), float(told[0]), float(told[3]),
+                    float(np.sqrt(squared.mean())), told.told_of, told.good_and_wrong,
                 ])  # fmt: skip
                 print(*rows[-1], sep=", ", flush=True)
     write_table(folder / "plan_faults.csv", HEADER, rows)

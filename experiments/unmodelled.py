@@ -36,6 +36,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -66,10 +67,34 @@ DISPLACED_MM = 2.0
 MARKER_DEG, MARKER_MM, MARKER_EDGE = 1.2, 1.0, 4.0
 """Size of the error, and how steeply it sets in: relative to the SD of the cosine of the angle at
 which the tracker sees the markers."""
-HEADER = [
-    "fault", "images", "trials", "told_of", "right", "two_targets", "good_or_fair",
-    "good_and_wrong", "stated_good_and_wrong",
-]  # fmt: skip
+
+
+class Judged(NamedTuple):
+    """What one calibration says, or in which share of them it is said.
+
+    Attributes:
+        told_of: something is told of.
+        right: it is the right thing.
+        two_targets: it is two targets.
+        good_or_fair: the verdict is.
+        good_and_wrong: it is so, although the error is beyond the end of its 95 % interval.
+        stated_good_and_wrong: the same of what the covariance states by itself.
+    """
+
+    told_of: float = False
+    right: float = False
+    two_targets: float = False
+    good_or_fair: float = False
+    good_and_wrong: float = False
+    stated_good_and_wrong: float = False
+
+    @classmethod
+    def shares(cls, told: list[Judged]) -> Judged:
+        """In which share of these each of it is so."""
+        return cls(*map(float, np.mean(told, axis=0)))
+
+
+HEADER = ["fault", "images", "trials", *Judged._fields]
 
 
 def dipole(key: Array, positions: Array) -> Array:
@@ -174,15 +199,15 @@ def judged(
     x: np.ndarray,
     fault: str,
     truly: Callable[[np.ndarray], np.ndarray],
-) -> list[bool]:
+) -> Judged:
     """What is told of, and what the verdict is worth, for one calibration."""
     record = calibration_record(result, recording)
     if record["wrong_frames"]:
         # It names the scale, and the record states no error.
-        return [True, fault == "scale", False, False, False, False]
+        return Judged(told_of=True, right=fault == "scale")
     tre = record["tre"]
     if tre is None or tre.get("rms_mm") is None:
-        return [False] * 6
+        return Judged()
     groups = any("two groups" in words for words in tre["contradictions"])
     kind = None if tre["unmodelled"] is None else tre["unmodelled"]["kind"]
     # The images with the second echo are a group that has another origin.
@@ -196,7 +221,7 @@ def judged(
     good = record["verdict"] in ("good", "fair")
     stated = tre["stated_mm"] <= FAIR_MM and error > tre["stated_interval_mm"][1]
     wrong = good and error > tre["interval_95_mm"][1]
-    return [groups or kind is not None, right, kind == "targets", good, wrong, stated]
+    return Judged(groups or kind is not None, right, kind == "targets", good, wrong, stated)
 
 
 def main() -> None:
@@ -221,8 +246,7 @@ def main() -> None:
                 )
                 for k in range(trials)
             ]  # fmt: skip
-            shares = np.mean(told, axis=0)
-            rows.append([fault, images, trials, *map(float, shares)])
+            rows.append([fault, images, trials, *Judged.shares(told)])
             print(*rows[-1], sep=", ", flush=True)
     write_table(folder / "unmodelled.csv", HEADER, rows)
     print(machine())

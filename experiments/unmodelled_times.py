@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from common import arguments, machine, write_table
 from jaxtyping import Array
-from unmodelled import BESIDE_MM, HEADER, judged, wrong_poses
+from unmodelled import BESIDE_MM, HEADER, Judged, judged, wrong_poses
 
 import jaxcal
 from jaxcal.data.probe import C5_2, L14_5, CurvilinearProbe, LinearProbe
@@ -100,11 +100,11 @@ def row(condition: int, trials: int) -> list[object]:
     problems, x = draw(probe, images, fault, condition * 1_000_000 + jnp.arange(trials))
     results = jaxcal.calibrate_batch(problems, estimate=estimate, data="channels").numpy()
     problems, x = jax.tree.map(np.asarray, problems), np.asarray(x)
-    told: list[list[bool]] = []
+    told: list[Judged] = []
     for k in range(trials):
         problem = jax.tree.map(lambda leaf, k=k: leaf[k], problems)
         told.append(judged(results[k], recording_of(problem, probe), x[k], fault, truly))
-    return [name, fault, images, trials, *map(float, np.mean(told, axis=0))]
+    return [name, fault, images, trials, *Judged.shares(told)]
 
 
 def main() -> None:
