@@ -174,6 +174,15 @@ claim(
 )
 claim(
     ACCURACY,
+    "of recordings without an error {:.0f} to {:.0f} % are told of one with 12 images, and {:.1f} "
+    "to {:.1f} % with 30 and 60.",
+    lambda: [
+        *percent(span(column("plan_faults", "told_of", curve_mm="0", images="12"))),
+        *percent(span(column("plan_faults", "told_of", curve_mm="0", images=("30", "60")))),
+    ],
+)
+claim(
+    ACCURACY,
     "{:.2f} to {:.2f} mm (TRE, a fifth fills space), at random poses by {:.2f} to {:.2f} mm.",
     lambda: (*_filled("tre_mm", "0.2"), *_filled("tre_mm", "", poses="random")),
 )
