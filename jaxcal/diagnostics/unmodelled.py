@@ -411,11 +411,18 @@ def _statistic(
     """2 ln LR of the columns after the ``known`` unknowns, what they leave, and the step of all."""
     before, _ = tuned(errors, rows[..., :known], images)
     after, step = tuned(errors, rows, images)
-    # Every kind gives its share of the unknowns' degrees of freedom, and its part of theta's.
-    touched = np.any(rows[..., known:] != 0, axis=(0, 2))
-    further = rows.shape[-1] - known
-    freedom = images - known / errors.shape[1] - touched * (further / touched.sum())
+    freedom = images - _fitted_freedom(rows, after)
     return float(np.sum(freedom * np.log(before / after))), after, step
+
+
+def _fitted_freedom(
+    rows: Float[Array, "m kinds q"], variance: Float[Array, " kinds"]
+) -> Float[Array, " kinds"]:
+    """How many degrees of freedom of each kind of errors a fit takes: the kind's leverage."""
+    scale = np.sqrt(np.maximum(np.sum(rows**2, axis=(0, 1)), 1e-300))
+    weighted = rows / scale / np.sqrt(variance)[:, None]
+    basis = np.linalg.qr(weighted.reshape(-1, rows.shape[-1]))[0]
+    return np.sum(basis.reshape(rows.shape) ** 2, axis=(0, 2))
 
 
 def _two_groups(
