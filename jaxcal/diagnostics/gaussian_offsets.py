@@ -122,3 +122,13 @@ def tuned(
         left = errors + rows @ step
         variance = np.maximum(np.sum(left**2, axis=0) / images, 1e-12)
     return variance, step
+
+
+def leverage(
+    rows: Float[Array, "m kinds q"], variance: Float[Array, " kinds"]
+) -> Float[Array, " kinds"]:
+    """How many degrees of freedom of each kind of errors a fit with these variances takes."""
+    scale = np.sqrt(np.maximum(np.sum(rows**2, axis=(0, 1)), 1e-300))
+    weighted = rows / scale / np.sqrt(variance)[:, None]
+    basis = np.linalg.qr(weighted.reshape(-1, rows.shape[-1]))[0]
+    return np.sum(basis.reshape(rows.shape) ** 2, axis=(0, 2))

@@ -22,15 +22,15 @@ Ten are looked for with a few parameters theta, linearised at the answer:
     beside  the target lies beside the image plane by m in all images, so ranges are too long by
             m^2 / (2 r), which hardly any other error imitates; theta = m^2
 
-With e the whitened errors, J their derivatives by the unknowns and K those by theta, the fit of
-e + J d + K theta gives the likelihood ratio LR. The SDs of the three kinds of errors are tuned
-again, as they were for the answer: 2 ln LR is the sum over the kinds of f ln(before / after), with
-f the kind's degrees of freedom after the fit. By Wilks it is chi squared if theta is zero. It must
-exceed what chance exceeds once in a thousand recordings. That of a step, of X or of the target, is
-the largest of all places where the step may be. Its limit was found by simulation: Gaussian errors
-of equal size exceed 22 once in a thousand recordings, and errors that grow with depth 26 as often
-as they exceed the limit of a slip. An answer within bounds is first moved to the optimum of
-Gaussian offsets.
+With e the whitened errors, J their derivatives by the unknowns and K those by theta, the fit of e +
+J d + K theta gives the likelihood ratio LR. The SDs of the three kinds of errors are tuned again,
+as they were for the answer: 2 ln LR is the sum over the kinds of f ln(before / after), with f the
+kind's degrees of freedom after the fit: the images less the kind's leverage in it. By Wilks it is
+chi squared if theta is zero. It must exceed what chance exceeds once in a thousand recordings. That
+of a step, of X or of the target, is the largest of all places where the step may be. Its limit was
+found by simulation: Gaussian errors of equal size exceed 22 once in a thousand recordings, and
+errors that grow with depth 26 as often as they exceed the limit of a slip. An answer within bounds
+is first moved to the optimum of Gaussian offsets.
 
 An eleventh, a distortion of the tracked positions, has a random field instead of few parameters
 (:mod:`jaxcal.diagnostics.tracker_distortion`). Its limit is from simulations with errors that grow
@@ -64,7 +64,13 @@ from jaxcal.data.problem import Problem
 from jaxcal.diagnostics import tracker_distortion
 from jaxcal.diagnostics.change_point import change_point
 from jaxcal.diagnostics.channel_points import as_points, excess_of_points
-from jaxcal.diagnostics.gaussian_offsets import GaussianOffsets, in_sds, shortened, tuned
+from jaxcal.diagnostics.gaussian_offsets import (
+    GaussianOffsets,
+    in_sds,
+    leverage,
+    shortened,
+    tuned,
+)
 from jaxcal.diagnostics.image_errors import ImageErrors
 from jaxcal.diagnostics.second_target import FEWEST as FEWEST_OF_TWO
 from jaxcal.diagnostics.second_target import two_groups
@@ -79,10 +85,6 @@ Array = np.ndarray
 
 FEWEST = 10
 """With fewer images in use nothing is looked for."""
-_FEWEST_OF_ALL, _FEWEST_CONVENTIONAL = 12, 15
-"""With fewer images, or fewer in conventional fits, only a target beside the plane is looked for:
-other errors are imitated by chance (of 300 clean conventional fits of 12 images, 9 would be
-reported)."""
 
 _OF_POINTS = ("scale", "lateral", "skew", "curve")
 """Errors of the measured points (:func:`_excess`); not looked for in times of flight."""
@@ -195,12 +197,8 @@ def unmodelled(
     used = np.asarray(answer.mask)[0] > 0
     if used.sum() < FEWEST:
         return []
-    conventional = calibration.method == "conventional"
-    few = used.sum() < (_FEWEST_CONVENTIONAL if conventional else _FEWEST_OF_ALL)
     candidates = _candidates(seen, used, speed)
     with np.errstate(all="ignore"):
-        if few:
-            return _explained(answer, seen, used, [e for e in candidates if e.kind == "beside"])
         candidates += _steps(answer, seen, used)
         if velocity is not None:
             candidates += _lag(answer, seen, used, velocity)
@@ -389,12 +387,12 @@ def _fit(
 
     With the mean squared errors that they leave of each kind.
     """
-    statistic, after, step = _statistic(errors, rows, known, images)
+    statistic, after, step = likelihood_ratio(errors, rows, known, images)
     limit = _BY_CHANCE[tried.kind]
     if not statistic > limit:
         return None
     if tried.kind in _AT_ONCE:
-        in_plane, *_ = _statistic(errors[:, :2], rows[:, :2], known, images)
+        in_plane, *_ = likelihood_ratio(errors[:, :2], rows[:, :2], known, images)
         if not in_plane > limit / 2:
             return None
     values, step = step[known:], step[:known]
@@ -405,24 +403,14 @@ def _fit(
     return Unmodelled(tried.kind, values, statistic, step, tried.image), after
 
 
-def _statistic(
+def likelihood_ratio(
     errors: Float[Array, "m kinds"], rows: Float[Array, "m kinds q"], known: int, images: int
 ) -> tuple[float, Float[Array, " kinds"], Float[Array, " q"]]:
     """2 ln LR of the columns after the ``known`` unknowns, what they leave, and the step of all."""
     before, _ = tuned(errors, rows[..., :known], images)
     after, step = tuned(errors, rows, images)
-    freedom = images - _fitted_freedom(rows, after)
+    freedom = images - leverage(rows, after)
     return float(np.sum(freedom * np.log(before / after))), after, step
-
-
-def _fitted_freedom(
-    rows: Float[Array, "m kinds q"], variance: Float[Array, " kinds"]
-) -> Float[Array, " kinds"]:
-    """How many degrees of freedom of each kind of errors a fit takes: the kind's leverage."""
-    scale = np.sqrt(np.maximum(np.sum(rows**2, axis=(0, 1)), 1e-300))
-    weighted = rows / scale / np.sqrt(variance)[:, None]
-    basis = np.linalg.qr(weighted.reshape(-1, rows.shape[-1]))[0]
-    return np.sum(basis.reshape(rows.shape) ** 2, axis=(0, 2))
 
 
 def _two_groups(
