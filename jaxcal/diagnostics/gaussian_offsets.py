@@ -127,7 +127,10 @@ def tuned(
 def leverage(
     rows: Float[Array, "m kinds q"], variance: Float[Array, " kinds"]
 ) -> Float[Array, " kinds"]:
-    """How many degrees of freedom of each kind of errors a fit with these variances takes."""
+    """How many degrees of freedom of each kind of errors a fit with these variances takes.
+
+    The sum of the kind's diagonal elements of the projection (hat) matrix of the weighted fit.
+    """
     scale = np.sqrt(np.maximum(np.sum(rows**2, axis=(0, 1)), 1e-300))
     weighted = rows / scale / np.sqrt(variance)[:, None]
     basis = np.linalg.qr(weighted.reshape(-1, rows.shape[-1]))[0]

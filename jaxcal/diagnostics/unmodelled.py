@@ -22,15 +22,15 @@ Ten are looked for with a few parameters theta, linearised at the answer:
     beside  the target lies beside the image plane by m in all images, so ranges are too long by
             m^2 / (2 r), which hardly any other error imitates; theta = m^2
 
-With e the whitened errors, J their derivatives by the unknowns and K those by theta, the fit of e +
-J d + K theta gives the likelihood ratio LR. The SDs of the three kinds of errors are tuned again,
-as they were for the answer: 2 ln LR is the sum over the kinds of f ln(before / after), with f the
-kind's degrees of freedom after the fit: the images less the kind's leverage in it. By Wilks it is
-chi squared if theta is zero. It must exceed what chance exceeds once in a thousand recordings. That
-of a step, of X or of the target, is the largest of all places where the step may be. Its limit was
-found by simulation: Gaussian errors of equal size exceed 22 once in a thousand recordings, and
-errors that grow with depth 26 as often as they exceed the limit of a slip. An answer within bounds
-is first moved to the optimum of Gaussian offsets.
+With e the whitened errors, J their derivatives by the unknowns and K those by theta, the fit of
+e + J d + K theta gives the likelihood ratio LR. The SDs of the three kinds of errors are tuned
+again, as they were for the answer. 2 ln LR is the sum over the kinds of f ln(before / after), with
+f the number of images less the kind's leverage in the fit. By Wilks it is chi squared if theta is
+zero. It must exceed what chance exceeds once in a thousand recordings. That of a step, of X or of
+the target, is the largest of all places where the step may be. Its limit was found by simulation:
+Gaussian errors of equal size exceed 22 once in a thousand recordings, and errors that grow with
+depth 26 as often as they exceed the limit of a slip. An answer within bounds is first moved to the
+optimum of Gaussian offsets.
 
 An eleventh, a distortion of the tracked positions, has a random field instead of few parameters
 (:mod:`jaxcal.diagnostics.tracker_distortion`). Its limit is from simulations with errors that grow

@@ -26,7 +26,7 @@ def axial_on_circle(
 
 
 def arc_limit(bound: Any, distance: Float[Any, "*batch n"]) -> Float[Any, "*batch n"]:
-    """The largest |y| on the arc, mm: the bound, but never the whole range r (mm)."""
+    """The largest |y| on the arc, mm: the bound, but at most LARGEST_ELEVATION of the range."""
     return array_module(bound, distance).minimum(bound, LARGEST_ELEVATION * abs(distance))
 
 
