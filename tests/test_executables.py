@@ -266,6 +266,23 @@ def test_what_makes_another_program(other):
     assert len(traced) == 2
 
 
+def test_numbers_of_numpy_in_a_plan_are_told_apart():
+    """Each value makes a program of its own; the same value of Python's shares it."""
+    for plan in (np.float64(2.0), np.float64(3.0), np.float32(4.0), 2.0):
+        check(run(plan), float(plan))
+    assert len(files()) == 3
+    for plan in (np.ones(1), jnp.ones(())):
+        assert not executables.is_describable(plan)
+        with pytest.raises(executables.NotDescribableError):
+            run(plan)
+
+
+def test_probes_and_options_hold_numbers_of_python():
+    probe = jaxcal.LinearProbe(pitch_mm=np.float64(0.4))
+    options = jaxcal.Options(tolerance_mm=np.float64(0.5))
+    assert type(probe.pitch_mm) is type(options.tolerance_mm) is float
+
+
 def test_another_installation_has_other_programs(monkeypatch):
     run()
     monkeypatch.setattr(executables, "installation", lambda: "another jaxlib")

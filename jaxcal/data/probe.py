@@ -35,11 +35,14 @@ class _Array:
     delay_s: float
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
+        for name, value in dict(vars(self)).items():
             if value is None or real_array(value, name).ndim:
                 raise InputError(f"{name} must be one number, not {value}")
+            # Python's own number, whose value is part of what a program is compiled for.
+            object.__setattr__(self, name, real_array(value, name).item())
         if not 2 <= self.elements <= MOST_ELEMENTS or self.elements != int(self.elements):
             raise InputError(f"a probe needs 2 to {MOST_ELEMENTS} elements, not {self.elements}")
+        object.__setattr__(self, "elements", int(self.elements))
         if not (np.isfinite(self.pitch_mm) and 0 < self.pitch_mm < 100):
             raise InputError(f"probe pitch must be in mm between 0 and 100, not {self.pitch_mm}")
         check_sound_speed(self.sound_speed_m_s)

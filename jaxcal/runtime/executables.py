@@ -191,7 +191,7 @@ def run(
     key = json.dumps(
         {
             "function": name,
-            "plan": describe(plan, []),
+            "plan": describe(plan),
             "arguments": described,
             "leaves": [[leaf.dtype.name, list(leaf.shape)] for leaf in leaves],
             "device": [device.platform, device.id],
@@ -357,19 +357,22 @@ def processor() -> Any | None:
     return None
 
 
-def describe(tree: Any, leaves: list[Any]) -> Description:
+def describe(tree: Any, leaves: list[Any] | None = None) -> Description:
     """Describe a tree by what JSON can hold.
 
     Args:
         tree: of dataclasses of jaxcal (modules too), tuples, lists, None, numbers, texts, arrays.
-        leaves: a list, to which the arrays are appended.
+        leaves: a list, to which arrays and numpy's numbers are appended: their values are not in
+            the description. Without a list numpy's numbers are described by their values.
 
     Raises:
-        NotDescribableError: it holds anything else.
+        NotDescribableError: it holds anything else, or arrays without a list for them.
     """
-    if isinstance(tree, (np.ndarray, np.generic, jax.Array)):
+    if leaves is not None and isinstance(tree, (np.ndarray, np.generic, jax.Array)):
         leaves.append(tree)
         return {"leaf": len(leaves) - 1}
+    if isinstance(tree, np.generic):
+        tree = tree.item()
     if tree is None or isinstance(tree, (bool, int, float, str)):
         return tree
     if isinstance(tree, (tuple, list)):
@@ -386,10 +389,10 @@ def describe(tree: Any, leaves: list[Any]) -> Description:
     raise NotDescribableError(f"{kind.__module__}.{kind.__qualname__} cannot be described")
 
 
-def is_describable(tree: Any) -> bool:
-    """Whether :func:`describe` accepts a tree."""
+def is_describable(plan: Any) -> bool:
+    """Whether :func:`describe` accepts a plan, whose values count."""
     try:
-        describe(tree, [])
+        describe(plan)
     except NotDescribableError:
         return False
     return True

@@ -89,11 +89,17 @@ class Options:
             raise InputError(f"precision must be float64 or float32, not {shown(self.precision)}")
         check_flag("differentiate", self.differentiate)
         tiny = np.finfo(float).tiny
-        check_size("gradient_tolerance", self.gradient_tolerance, tiny, unit="")
-        check_size("tolerance_rad", self.tolerance_rad, tiny, unit="rad")
-        check_size("tolerance_mm", self.tolerance_mm, tiny)
+        for name, unit in _TOLERANCES.items():
+            value = getattr(self, name)
+            check_size(name, value, tiny, unit=unit)
+            object.__setattr__(self, name, float(value))
         for name in ("max_rounds", "inner_steps", "max_iterations", "trace"):
-            whole_number(name, getattr(self, name), int(name != "trace"), MOST_STEPS)
+            value = whole_number(name, getattr(self, name), int(name != "trace"), MOST_STEPS)
+            object.__setattr__(self, name, value)
+
+
+_TOLERANCES = {"gradient_tolerance": "", "tolerance_rad": "rad", "tolerance_mm": "mm"}
+"""Tolerances of :class:`Options` and their units."""
 
 
 @dataclass(frozen=True)

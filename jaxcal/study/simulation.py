@@ -110,8 +110,9 @@ class Protocol:
     tracker_rad: Scalar = 0.0
 
     def __post_init__(self) -> None:
-        whole_number("images", self.images, MINIMUM_IMAGES, MOST_IMAGES)
-        whole_number("test_images", self.test_images, 0, MOST_IMAGES)
+        for name, least in (("images", MINIMUM_IMAGES), ("test_images", 0)):
+            number = whole_number(name, getattr(self, name), least, MOST_IMAGES)
+            object.__setattr__(self, name, number)
         try:
             shallow, deep = self.depth_mm
         except (TypeError, ValueError):
