@@ -82,8 +82,7 @@ def away_from_gaussian(
     if answer.problem is None or not limited or images < MINIMUM_SELF_TUNING:
         return None
     fit = GaussianOffsets.of(batch_of_one(answer))
-    # Every kind gives a third of the unknowns' degrees of freedom.
-    variance = fit.variance / (1 - fit.rows.shape[-1] / (3 * images))
+    variance = fit.variance / (1 - leverage(fit.rows, fit.variance) / images)
     information = np.einsum("mkp,mkq->pq", fit.rows / variance[:, None], fit.rows)
     weight = mean_of_squares(image_jacobian(answer, grid))
     error = np.trace(weight @ np.linalg.pinv(information, hermitian=True))

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxcal.diagnostics.gaussian_offsets import shortened, tuned
+from jaxcal.diagnostics.gaussian_offsets import leverage, shortened, tuned
 from jaxcal.runtime.array_types import Bool, Float
 
 Array = np.ndarray
@@ -70,25 +70,26 @@ def two_groups(
     """
     count, unknowns = len(errors), rows.shape[-1] - size
     known, along = rows[..., :unknowns], 0.5 * rows[..., unknowns:]
-    # Every kind gives a third of the unknowns' degrees of freedom; t takes those of two kinds.
-    freedom = count - unknowns / 3 - 0.5 * size * np.array([1.0, 1.0, 0.0])
 
-    def fitted(side: Array, some: Array) -> tuple[Array, Array]:
+    def fitted(side: Array, some: Array) -> tuple[Array, Array, float]:
+        # Mean squared errors that a division leaves, the step, and 2 ln LR.
         both = np.concatenate([known[some], side[:, None, None] * along[some]], axis=-1)
-        return tuned(*shortened(errors[some], both), len(some))
+        fewer, of_fewer = shortened(errors[some], both)
+        after, step = tuned(fewer, of_fewer, len(some))
+        freedom = len(some) - leverage(of_fewer, after)
+        return after, step, float(np.sum(freedom * np.log(before / after)))
 
     every = np.arange(count)
     some = np.unique(np.linspace(0, count - 1, _MOST_SEARCHED).astype(int))
     side = _divided(errors[some], known[some], along[some], 1 / np.sqrt(before))
-    after, step = fitted(side, some)
+    after, step, _ = fitted(side, some)
     statistic, side = 0.0, np.zeros(count)
     for _ in range(_ROUNDS):
         base, half = errors + known @ step[:unknowns], along @ step[unknowns:]
         last, side = side, _nearer(base, half, 1 / np.sqrt(after))
         if (side == last).all():
             break
-        after, step = fitted(side, every)
-        statistic = float(np.sum(freedom * np.log(before / after)))
+        after, step, statistic = fitted(side, every)
         if count > _MOST_SEARCHED and statistic < BY_CHANCE * count / 2:
             # Further rounds gain little, and take long.
             return None
