@@ -12,7 +12,9 @@ from jaxcal.io import lines as text_files
 from jaxcal.io import table
 from jaxcal.io.importing.frame_poses import tool_poses
 from jaxcal.io.importing.sources import ImportOptions
+from jaxcal.io.slicer import read_markups
 from jaxcal.io.text import read_crosswire, read_pose_table, recording_of
+from jaxcal.io.trackers import read_tracker
 
 CROSSWIRE = Path(__file__).parents[2] / "shared" / "data" / "crosswire"
 
@@ -274,6 +276,23 @@ def test_a_table_of_too_many_rows_is_not_read(tmp_path, monkeypatch):
     path.write_text("u,v\n" + "1,2\n" * 4)
     with pytest.raises(FormatError, match=r"table\.csv:5: more than 3 rows"):
         read_pose_table(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "before", "read"),
+    [
+        ("t.csv", "u,v\n", table.read_table),
+        ("t.csv", "", table.first_line),
+        ("t.csv", "", read_tracker),
+        ("p.fcsv", "", read_markups),
+    ],
+)
+def test_a_cell_longer_than_the_module_csv_takes_is_named(tmp_path, name, before, read):
+    line = 1 + before.count("\n")
+    long = f'"{"1" * 140_000}",2\n'
+    (tmp_path / name).write_text(before + long)
+    with pytest.raises(FormatError, match=rf"{name}:{line}: field larger than field limit"):
+        read(tmp_path / name)
 
 
 def test_missing_directory_and_device(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import io
 import os
 import re
@@ -54,3 +55,20 @@ def text_lines(
             raise FormatError(f"{name}:{number}: is longer than {LONGEST_LINE} characters")
         if line.strip() and (comments or not _COMMENT.match(line)):
             yield number, line.rstrip("\n")
+
+
+def cells_of(where: str, content: str, separator: str = ",") -> list[str]:
+    """Cells of one line of a table, some of which may be in quotes.
+
+    Args:
+        where: the line's number, for a message.
+        content: the line.
+        separator: one character between cells.
+
+    Raises:
+        FormatError: a cell is longer than the module csv takes; the message begins with ``where``.
+    """
+    try:
+        return next(csv.reader([content], delimiter=separator))
+    except csv.Error as error:
+        raise FormatError(f"{where}: {error}") from None

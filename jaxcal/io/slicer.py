@@ -6,7 +6,6 @@ with x and y negated.
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 import sys
@@ -17,7 +16,7 @@ import numpy as np
 
 from jaxcal import FormatError
 from jaxcal.io.given_files import naming, one_line, read_bytes
-from jaxcal.io.lines import text_lines
+from jaxcal.io.lines import cells_of, text_lines
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.messages import quoted
 
@@ -99,7 +98,7 @@ def _read_fcsv(path: str | os.PathLike[str]) -> Markups:
                 names = [name.strip() for name in value.split(",")]
             continue
         # Slicer puts a label that has a comma in quotes.
-        cells = [cell.strip() for cell in next(csv.reader([content]))]
+        cells = [cell.strip() for cell in cells_of(f"line {line}", content)]
         if len(cells) < 4 or not {"x", "y", "z"} <= set(names[: len(cells)]):
             raise FormatError(f"line {line}: {len(cells)} columns are no point of Slicer")
         row = dict(zip(names, cells, strict=False))

@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxcal import FormatError
 from jaxcal.io.columns import names_columns
-from jaxcal.io.lines import text_lines
+from jaxcal.io.lines import cells_of, text_lines
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.messages import quoted
 
@@ -145,7 +145,7 @@ def read_table(
             continue
         if separator is None:
             separator = _separator_of(content)
-        cells = _cells(content, separator)
+        cells = _cells(f"{name}:{line}", content, separator)
         if header and not rows and names is None and _is_header(cells, separator):
             # Some programs end every line, the header's too, with a separator.
             names = _without_blank_end(cells, 0)
@@ -189,7 +189,7 @@ def first_line(path: str | os.PathLike[str]) -> tuple[str, bool]:
     for line, content in text_lines(path):
         if not _STATED_SEPARATOR.fullmatch(content.strip("\r\n")):
             separator = _separator_of(content)
-            cells = _cells(content, separator)
+            cells = _cells(f"{os.fspath(path)}:{line}", content, separator)
             named = _is_header(cells, separator) or _commented_header(path, line, cells, separator)
             return separator, bool(named)
     return "", False
@@ -200,13 +200,15 @@ def _commented_header(
 ) -> list[str] | None:
     """Names in the comment just before the first row, where ``numpy.savetxt`` writes a header."""
     before = ""
+    at = line
     for number, content in text_lines(path, comments=True):
         if number == line:
             break
-        before = content.strip()
+        at, before = number, content.strip()
     if not before.startswith("#"):
         return None
-    cells = _cells(before.removeprefix("#").strip(), separator)
+    where = f"{os.fspath(path)}:{at}"
+    cells = _cells(where, before.removeprefix("#").strip(), separator)
     header = len(cells) == len(row) and _is_header(cells, separator) and names_columns(cells)
     return cells if header else None
 
@@ -215,12 +217,12 @@ def _separator_of(content: str) -> str:
     return next((mark for mark in (";", "\t", ",") if mark in content.strip()), "")
 
 
-def _cells(content: str, separator: str) -> list[str]:
+def _cells(where: str, content: str, separator: str) -> list[str]:
     if not separator:
         return content.split()
     if '"' not in content:
         return [cell.strip() for cell in content.split(separator)]
-    return [cell.strip() for cell in next(csv.reader([content], delimiter=separator))]
+    return [cell.strip() for cell in cells_of(where, content, separator)]
 
 
 def _without_blank_end(cells: list[str], width: int) -> list[str]:

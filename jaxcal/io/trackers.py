@@ -6,7 +6,6 @@ from the tool to ``Tracker``.
 
 from __future__ import annotations
 
-import csv
 import itertools
 import math
 import os
@@ -22,7 +21,7 @@ from jaxcal.data.poses import rotations_from_quaternions
 from jaxcal.io.columns import LengthUnit
 from jaxcal.io.frame_names import FramePair
 from jaxcal.io.given_files import naming
-from jaxcal.io.lines import text_lines
+from jaxcal.io.lines import cells_of, text_lines
 from jaxcal.io.sequence import TrackedSequence
 from jaxcal.io.table import parse_number
 from jaxcal.runtime.messages import quoted
@@ -61,7 +60,7 @@ def read_tracker(
             states; file and line are named.
     """
     name = os.fspath(path)
-    rows = ((line, next(csv.reader([content]))) for line, content in text_lines(path))
+    rows = ((line, cells_of(f"line {line}", content)) for line, content in text_lines(path))
     with naming(path):
         line, first = next(rows, (1, [""]))
         if first[0].strip() == "Tools":
