@@ -557,8 +557,8 @@ def contradicted(kind, record):
         }  # fmt: skip
     else:
         changed["bootstrap"] = {
-            "reproducibility_mm": [2.3] * 5, "stated_mm": 0.4, "resamples": 200,
-            "resamples_converged": 190,
+            "reproducibility_mm": [0.5] * 5, "rms_scatter_mm": [2.3] * 5, "stated_mm": 0.4,
+            "resamples": 200, "resamples_converged": 190,
             "rotation_sd_deg": [0.1] * 3,
         }  # fmt: skip
     return changed
@@ -710,7 +710,7 @@ def test_resampling_that_agrees_changes_nothing(record, left_out):
     changed["cross_validation"] = {
         "folds": count, "folds_converged": count, "image_moved_mm": quiet, "stated_mm": 0.4,
     }  # fmt: skip
-    changed["bootstrap"] = {"reproducibility_mm": [0.42] * 5, "stated_mm": 0.4}
+    changed["bootstrap"] = {"rms_scatter_mm": [0.42] * 5, "stated_mm": 0.4}
     settle(changed)
     assert (changed["verdict"], changed["tre"]["factor"]) == ("good", 1.0)
 

@@ -314,6 +314,12 @@ def test_bootstrap_counts_draws_that_determine_a_calibration(data, whole):
     np.testing.assert_array_equal(used, different >= 4)
     expected = metrics.calibration_reproducibility(found.image_to_probe[used], found.image_points)
     np.testing.assert_allclose(found.reproducibility, expected, rtol=1e-9)
+    points = np.insert(found.image_points, 1, 0.0, axis=1)
+    transforms = np.asarray(found.image_to_probe)[used][:, None]
+    placed = (transforms[..., :3, :3] @ points[..., None])[..., 0] + transforms[..., :3, 3]
+    expected = np.sqrt(np.sum(np.var(placed, axis=0), axis=1))
+    np.testing.assert_allclose(found.rms_scatter, expected, rtol=1e-9)
+    assert (found.rms_scatter > found.reproducibility).all()
     four = replace(data, mask=data.mask.at[4:].set(0.0))
     with pytest.raises(jaxcal.InputError, match="a bootstrap needs more than 4 images"):
         bootstrap(four, COUNT, **CONVENTIONAL)

@@ -31,7 +31,7 @@ from jaxcal.data.problem import Problem, as_problem
 from jaxcal.data.recording import MINIMUM_IMAGES, Images, Recording
 from jaxcal.diagnostics.image_errors import noise_covariance
 from jaxcal.diagnostics.intervals import range_of_row_zero
-from jaxcal.diagnostics.metrics import distance_from_mean, reconstruct
+from jaxcal.diagnostics.metrics import distance_from_mean, reconstruct, rms_from_mean
 from jaxcal.model.thresholds import MAD
 from jaxcal.model.unknowns import measured, split_further, unknown_names
 from jaxcal.result.calibration import Calibration
@@ -109,6 +109,7 @@ class Bootstrap(eqx.Module):
             medians, so a few resamples with too few different images do not spoil it.
         reproducibility: (m,) mean distance of an image point from its mean over the resamples, mm,
             estimated pixel sizes, sound speed and delay included.
+        rms_scatter: (m,) root mean square of the same distances, mm.
         image_points: (m, 2) [lateral, axial] of those points, mm: corners and middle of the box
             that the measured points fill.
     """
@@ -117,6 +118,7 @@ class Bootstrap(eqx.Module):
     converged: Float[AnyArray, " k"]
     spread: Float[AnyArray, " 6"]
     reproducibility: Float[AnyArray, " m"]
+    rms_scatter: Float[AnyArray, " m"]
     image_points: Float[AnyArray, "m 2"]
 
 
@@ -333,6 +335,7 @@ def _scatter(
         converged=converged,
         spread=MAD * spread,
         reproducibility=distance_from_mean(transforms, points, converged),
+        rms_scatter=rms_from_mean(transforms, points, converged),
         image_points=points,
     )
 

@@ -121,6 +121,27 @@ def distance_from_mean(
     weight: Float[AnyArray, " k"],
 ) -> Float[AnyArray, " m"]:
     """The same by weighted means; NaN where all weights are zero."""
+    apart, share = _from_mean(transforms, image_points, weight)
+    return array_module(apart).sum(share * apart, axis=0)
+
+
+def rms_from_mean(
+    transforms: Float[AnyArray, "k 4 4"],
+    image_points: Float[AnyArray, "m 2"],
+    weight: Float[AnyArray, " k"],
+) -> Float[AnyArray, " m"]:
+    """Root mean square of these distances, which a covariance states as well."""
+    apart, share = _from_mean(transforms, image_points, weight)
+    xp = array_module(apart)
+    return xp.sqrt(xp.sum(share * apart**2, axis=0))
+
+
+def _from_mean(
+    transforms: Float[AnyArray, "k 4 4"],
+    image_points: Float[AnyArray, "m 2"],
+    weight: Float[AnyArray, " k"],
+) -> tuple[Float[AnyArray, "k m"], Float[AnyArray, "k 1"]]:
+    """Distances of image points from their weighted mean, and the weights as shares."""
     xp = array_module(transforms, image_points, weight)
     zero = xp.zeros_like(image_points[:, 0])
     points = xp.stack([image_points[:, 0], zero, image_points[:, 1]], axis=1)
@@ -128,4 +149,4 @@ def distance_from_mean(
     total = xp.sum(weight)
     share = (weight / xp.where(total > 0, total, xp.nan))[:, None]
     mean = xp.sum(share[..., None] * images, axis=0)
-    return xp.sum(share * xp.linalg.norm(images - mean, axis=-1), axis=0)
+    return xp.linalg.norm(images - mean, axis=-1), share

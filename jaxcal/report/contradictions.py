@@ -347,7 +347,7 @@ def _from_resampling(record: dict[str, Any]) -> list[tuple[float, str]]:
             words = f"the calibrations of the cross-validation {_scatter(scatter, stated)}"
             found.append((scatter / stated, words))
     if drawn is not None and drawn["stated_mm"]:
-        known = [value for value in drawn["reproducibility_mm"] if value is not None]
+        known = [value for value in drawn["rms_scatter_mm"] if value is not None]
         scatter = math.sqrt(sum(value**2 for value in known) / max(len(known), 1))
         stated = drawn["stated_mm"]
         if scatter > SCATTER_TIMES * stated:

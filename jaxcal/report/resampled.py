@@ -50,6 +50,7 @@ def bootstrap_record(found: Bootstrap, result: Calibration) -> dict[str, Any]:
             "rotation_sd_deg": np.degrees(spread[3:]),
             "image_points_mm": np.asarray(found.image_points),
             "reproducibility_mm": np.asarray(found.reproducibility),
+            "rms_scatter_mm": np.asarray(found.rms_scatter),
             "stated_mm": stated_at(result, np.asarray(found.image_points)),
         }
     )
