@@ -131,6 +131,23 @@ def test_small_errors_are_not_zero_and_estimates_are_told(record, result, record
     assert ">0.2 mm of distance<" in text
 
 
+@pytest.mark.parametrize("freedom", [3.0, None])
+def test_the_ellipsoid_of_the_target_holds_95_percent(record, result, recording, freedom):
+    """Vectors with Student's distribution, drawn from its definition."""
+    parser = Tags()
+    parser.feed(page({**record, "degrees_of_freedom": freedom}, result, recording))
+    scene = json.loads(parser.inside["scene-target"])
+    rings = [np.array(line["points"]) - scene["centre"] for line in scene["lines"]]
+    longest = max(np.linalg.norm(ring, axis=1).max() for ring in rings)
+    covariance = np.asarray(result.point_covariance)
+    square = longest**2 / np.linalg.eigvalsh(covariance).max()
+    draw = np.random.default_rng(0)
+    normal = draw.standard_normal((200_000, 3))
+    share = 1.0 if freedom is None else draw.chisquare(freedom, 200_000) / freedom
+    inside = np.mean(np.sum(normal**2, axis=1) / share <= square)
+    assert inside == pytest.approx(0.95, abs=0.003)
+
+
 def test_matrix_to_copy_is_the_one_that_is_exported(tags, result, tmp_path):
     (tmp_path / "cal.json").write_text(tags.inside["form-json"])
     loaded = load_calibration(tmp_path / "cal.json")

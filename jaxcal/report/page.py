@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy import special
 
 from jaxcal import InputError
 from jaxcal.data.poses import targets_in_images
@@ -339,8 +340,13 @@ def _scene(record: dict[str, Any], answer: Calibration, recording: Recording) ->
         "dots": dots,
         "bar": svg.bar_length(float(np.linalg.norm(np.ptp(far, axis=0)))),
     }
-    close = _close_up(answer, cloud, shown)
-    ellipsoid = " with its 95 % ellipsoid (lines)" if close["lines"] else ""
+    close = _close_up(answer, cloud, shown, record["degrees_of_freedom"])
+    ellipsoid = ""
+    if close["lines"]:
+        ellipsoid = (
+            " with its 95 % ellipsoid (lines), from the covariance and the degrees of freedom of "
+            "its SDs, without what contradicts the noise model"
+        )
     all_images = (
         "Planes of the images (blue, with a dot where lateral position and depth are zero) and the "
         "target (orange), in the tracker's frame."
@@ -369,7 +375,7 @@ def _view(name: str, scene: dict[str, Any], words: str) -> str:
 
 
 def _close_up(
-    answer: Calibration, cloud: Float[np.ndarray, "n 3"], shown: np.ndarray
+    answer: Calibration, cloud: Float[np.ndarray, "n 3"], shown: np.ndarray, freedom: float | None
 ) -> dict[str, Any]:
     point, named = np.asarray(answer.point), set(outliers(answer))
     lines: list[dict[str, Any]] = []
@@ -377,8 +383,7 @@ def _close_up(
     reach = 0.0
     if np.isfinite(covariance).all():
         values, vectors = np.linalg.eigh(covariance)
-        # 7.81: 95 % point of chi squared with three degrees of freedom.
-        axes = vectors * np.sqrt(7.81 * np.maximum(values, 0.0))
+        axes = vectors * np.sqrt(square_within(freedom) * np.maximum(values, 0.0))
         reach = float(np.linalg.norm(axes, axis=0).max())
         turned = np.linspace(0, 2 * np.pi, 49)
         circle = np.stack([np.cos(turned), np.sin(turned)], axis=-1)
@@ -406,6 +411,18 @@ def _close_up(
         "dots": dots,
         "bar": svg.bar_length(2 * radius),
     }
+
+
+def square_within(freedom: float | None, probability: float = 0.95) -> float:
+    """The square, in SDs, below which a vector along three axes is with this probability.
+
+    Args:
+        freedom: degrees of freedom of Student's distribution; None if the vector is normal.
+        probability: of the vector to be inside.
+    """
+    if freedom is None:
+        return float(special.chdtri(3, 1 - probability))
+    return 3 * float(special.fdtri(3, freedom, probability))
 
 
 def _rounded(values: Any) -> Any:
