@@ -385,6 +385,10 @@ def test_verdict_says_what_rests_on_an_assumption(record):
     sight = {**record["observability"], "known_only_from_prior": "rotation about the lateral axis"}
     said = verdict({**record, "prior": "gaussian", "observability": sight})
     assert any("do not determine rotation about the lateral axis" in line for line in said)
+    for probability, words in ((0.9, "a mean of the offsets"), (0.1, "the assumption that")):
+        law = {"mean_probability": probability, "words": "Gaussian."}
+        mean = {**record, "prior": "gaussian", "observability": sight, "offset_law": law}
+        assert f"it rests on {words}" in " ".join(verdict(mean))
 
 
 def test_tables(record, failed, recording):

@@ -151,13 +151,22 @@ def _weak_elevation(result: Calibration) -> list[str]:
     if not sd > WEAK_TRANSLATION_MM:
         return []
     law = result.offset_law
-    on = "a mean of the offsets that the data hardly determine"
-    if law is None or not law.mean_probability > 0.5:
-        on = "the assumption that the offsets average zero"
+    on = rests_on(None if law is None else float(law.mean_probability))
     return [
         f"translation along the elevational axis is weakly determined (SD {sd:.2f} mm) and rests "
         f"on {on}"
     ]
+
+
+def rests_on(mean_probability: float | None) -> str:
+    """What decides where the images do not: the offsets' mean, in words.
+
+    Args:
+        mean_probability: that the offsets have another mean than zero; None if it is taken as zero.
+    """
+    if mean_probability is not None and mean_probability > 0.5:
+        return "a mean of the offsets that the data hardly determine"
+    return "the assumption that the target lay evenly on both sides of the image plane"
 
 
 def _misfitting_images(result: Calibration) -> list[str]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from jaxcal.diagnostics.warnings import WEAK_MM
+from jaxcal.diagnostics.warnings import WEAK_MM, rests_on
 from jaxcal.report.contradictions import MOST_IMAGES
 from jaxcal.report.paragraphs import listed
 from jaxcal.report.resampled import resampled_sentences
@@ -345,10 +345,9 @@ def certainty(record: dict[str, Any]) -> list[str]:
         )
     unseen = record["observability"]["known_only_from_prior"]
     if unseen and record["prior"] in TUNED:
-        lines.append(
-            f"The images do not determine {unseen}: it rests on the assumption that the target lay "
-            "evenly on both sides of the image plane."
-        )
+        law = record.get("offset_law")
+        on = rests_on(law and law["mean_probability"])
+        lines.append(f"The images do not determine {unseen}: it rests on {on}.")
     if record.get("offset_law"):
         lines.append(record["offset_law"]["words"])
     return lines
