@@ -15,6 +15,8 @@ from rich.console import Console
 
 import jaxcal
 from jaxcal import InputError, OutputError
+from jaxcal.calibration.calibrate import Request
+from jaxcal.cli.calibrate import _curves
 from jaxcal.data.recording import Recording, make_images
 from jaxcal.report.convergence import KEPT, Curve, bounded_curves
 from jaxcal.report.next_poses import next_poses_record, next_poses_sentences
@@ -451,6 +453,20 @@ def test_bounded_curves_end_in_one_minimum(recording, result):
     assert values[0].min() <= values[1].min() + 1e-9
     # The joint steps alone, without the warm-up that both share the like of.
     assert len(values[0]) < len(values[1])
+
+
+def test_curves_are_of_the_images_in_use(recording, result):
+    """An image that a robust solve left out is still in its problem."""
+    problem = jaxcal.Problem.from_recording(recording)
+    points = np.array(problem.measurements)
+    points[3] += 50.0
+    changed = dataclasses.replace(
+        result,
+        problem=dataclasses.replace(problem, measurements=jnp.asarray(points)),
+        mask=problem.mask.at[3].set(0.0),
+    )
+    for curve in _curves(Request("joint", "bounded"), changed):
+        assert np.nanmin(curve.objective) < 50.0**2 / 10
 
 
 @pytest.fixture(scope="module")

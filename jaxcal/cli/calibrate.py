@@ -288,7 +288,7 @@ def calibrate(
         record = dated(record)
         if folder is not None:
             with progress("drawing the report"):
-                write_report(folder, record, result, measured, _curves(measured, request, result))
+                write_report(folder, record, result, measured, _curves(request, result))
     if report is not None:
         from jaxcal.report.page import write_page
 
@@ -441,16 +441,17 @@ def _resampled(
     return found
 
 
-def _curves(recording: Recording, request: Request, result: Calibration) -> list[Curve]:
-    from jaxcal.data.problem import Problem
+def _curves(request: Request, result: Calibration) -> list[Curve]:
     from jaxcal.report.convergence import bounded_curves, own_curve
+    from jaxcal.result.calibration import data_of
 
     if request.method == "conventional":
         return [own_curve(result)]
     if request.method == "joint" and request.prior != "bounded":
         return []
     return bounded_curves(
-        Problem.from_recording(recording) if result.problem is None else result.problem,
+        # Without the images that --robust left out.
+        replace(data_of(result), mask=result.mask),
         max_elevation=request.max_elevation,
         estimate=request.estimate,
         alternating=result if request.method == "alternating" else None,
