@@ -97,6 +97,10 @@ def test_saved_and_loaded(tmp_path, extension):
     if extension == "json":
         assert (found.error_mm, found.converged) == (0.7, True)
     if extension == "xml":
+        # PLUS's own error is a trimmed mean: it goes back to PLUS, but is no RMS residual.
+        found.save(tmp_path / "again.json")
+        assert json.loads((tmp_path / "again.json").read_text())["rms_mm"] is None
+        assert 'Error="0.7"' in found.text("plus")
         path.unlink()
         known.save(path)  # the element alone
         np.testing.assert_array_equal(load_calibration(path).plus_matrix(), found.plus_matrix())

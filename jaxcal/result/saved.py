@@ -257,7 +257,7 @@ def _record(transform: ImageTransform) -> dict[str, Any]:
         "version": VERSION,
         "converged": transform.converged,
         **{k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in arrays.items()},
-        "rms_mm": transform.error_mm,
+        "rms_mm": transform.error_mm if transform.error_is_rms else None,
         "tre": None if transform.tre_factor == 1 else {"factor": transform.tre_factor},
         "pose_frames": None if probe == "Probe" else {"from": probe, "to": None},
         "degrees_of_freedom": transform.degrees_of_freedom,

@@ -76,7 +76,8 @@ class ImageTransform:
         unknowns: blocks of estimated unknowns that move an image point, X's first.
         image_covariance: (q, q) of all ``unknowns`` (mm, rad, log units); if it is None, only
             ``covariance`` counts.
-        error_mm: root mean square residual of the calibration, mm; None if unknown.
+        error_mm: root mean square residual of the calibration, mm; None if unknown. See
+            ``error_is_rms``.
         converged: whether the calibration can be used; None if unknown.
         source: the file, for messages.
         date: when the calibration was made, ISO 8601 with its time zone; None if unknown.
@@ -90,6 +91,8 @@ class ImageTransform:
         variance_factor: how many times larger the mean square errors are than the covariance says,
             because of these SDs (:func:`jaxcal.predicted_tre` includes it); 1 where that is
             not known.
+        error_is_rms: False where ``error_mm`` is what a file of PLUS states, which for fCal is the
+            mean of the lowest 95 % of its errors.
 
     Raises:
         InputError: wrong shapes, ``unknowns`` or ``date``; and, unless ``converged`` is False, NaN
@@ -113,6 +116,7 @@ class ImageTransform:
     tre_factor: float = 1.0
     degrees_of_freedom: float | None = None
     variance_factor: float = 1.0
+    error_is_rms: bool = True
 
     def __post_init__(self) -> None:
         moving = [name for name in TABLE if TABLE[name].in_image]
@@ -462,7 +466,7 @@ def transform_from_plus_matrix(
 
     Args:
         matrix: (u, v, 0, 1), px, to the probe, mm.
-        error_mm: the error that the file states, mm.
+        error_mm: the error that the file states, mm; it is not taken for a root mean square.
         source: the file, for messages.
 
     Raises:
@@ -498,4 +502,6 @@ def transform_from_plus_matrix(
     transform = np.eye(4)
     transform[:3, :3] = np.stack([lateral, np.cross(axial, lateral), axial], axis=1)
     transform[:3, 3] = matrix[:3, 3]
-    return ImageTransform(transform, scale, error_mm=error_mm, source=source)
+    return ImageTransform(
+        transform, scale, error_mm=error_mm, source=source, error_is_rms=error_mm is None
+    )
