@@ -256,6 +256,8 @@ def test_what_two_calibrations_should_share_and_do_not_is_told(files, tmp_path, 
     jaxcal.load_calibration(files[0]).save(again)
     for names in ((files[0], files[0]), (files[0], again)):
         assert "The two are one and the same calibration" in told(capsys, *names)
+        main(["compare", *names, *PIXELS, "--json"])
+        assert [pair["same"] for pair in json.loads(capsys.readouterr().out)["pairs"]] == [True]
     other = str(tmp_path / "other.json")
     frames = {"from": "Port 1", "to": None}
     changed = record | {"scale_mm_per_px": [0.05, 0.12], "plus_image_to_probe": None}
@@ -265,6 +267,11 @@ def test_what_two_calibrations_should_share_and_do_not_is_told(files, tmp_path, 
     assert "A pixel is 0.1000 x 0.1200 mm in the first and 0.0500 x 0.1200 mm in the second" in said
     assert "made from 'rec.h5'. If that is one recording, they share its errors" in said
     assert "different names" not in said
+    main(["compare", files[1], other, *PIXELS, "--json"])
+    in_json = json.loads(capsys.readouterr().out)
+    assert in_json["pairs"][0]["same"] is False
+    assert all(note in said for note in in_json["notes"])
+    assert len(in_json["notes"]) == 2
     Path(files[0]).write_text(json.dumps(record | {"pose_frames": {"from": "Wand", "to": None}}))
     said = told(capsys, files[0], other)
     assert "have different names: 'Wand' in the first, 'Port 1' in the second." in said

@@ -83,26 +83,27 @@ def compare(
         "recording, they share its errors, and their distance says nothing about their accuracy."
         for name in shared
     ]
+    one = len(pairs) == 1
+    whose = ["the first", "the second"] if one else list(calibrations)
+    notes = [
+        differing
+        for made, name in zip(transforms[1:], whose[1:], strict=True)
+        for differing in what_differs(
+            (transforms[0].probe_frame, made.probe_frame),
+            (transforms[0].scale_mm_per_px, made.scale_mm_per_px),
+            (whose[0], name),
+        )
+    ] + notes
     if as_json:
-        print_json({"pairs": [_record(*pair) for pair in pairs], "tre_factor": factors})
+        found = [_record(*pair) for pair in pairs]
+        print_json({"pairs": found, "tre_factor": factors, "notes": notes})
     else:
-        one = len(pairs) == 1
-        whose = ["the first", "the second"] if one else list(calibrations)
-        words = [
-            differing
-            for made, name in zip(transforms[1:], whose[1:], strict=True)
-            for differing in what_differs(
-                (transforms[0].probe_frame, made.probe_frame),
-                (transforms[0].scale_mm_per_px, made.scale_mm_per_px),
-                (whose[0], name),
-            )
-        ]
         if one:
             unit = "mm" if transforms[0].scale_mm_per_px is None else "px"
             shown = _table_of_points(pairs[0][2], unit), _sentence(pairs[0][2])
         else:
             shown = _table_of_pairs(pairs), _summary([pair[2] for pair in pairs])
-        print_page(*shown, *words, *notes)
+        print_page(*shown, *notes)
     apart = any(pair[2].agree is False for pair in pairs)
     return ExitCode.UNCERTAIN if apart else ExitCode.CONVERGED
 
@@ -121,7 +122,14 @@ def _record(first: str, second: str, found: Comparison) -> dict[str, Any]:
         "limit_95_mm": finite_or_none(found.limit_mm),
         "rotation_deg": found.rotation_deg,
         "agree": found.agree,
+        "same": _are_same(found),
     }
+
+
+def _are_same(found: Comparison) -> bool:
+    """Whether two files hold one calibration."""
+    expected = 1.0 if found.agree is None else found.expected_rms_mm
+    return found.rms_mm < _SAME * expected
 
 
 def _millimetres(value: float) -> str:
@@ -154,8 +162,7 @@ def _sentence(found: Comparison) -> str:
         f"image points are {found.rms_mm:.2f} mm apart (RMS), and the two images are turned by "
         f"{found.rotation_deg:.2f} degrees against each other"
     )
-    expected = 1.0 if found.agree is None else found.expected_rms_mm
-    if found.rms_mm < _SAME * expected:
+    if _are_same(found):
         return (
             "The two are one and the same calibration, which says nothing about its accuracy: "
             "compare calibrations from different recordings."
