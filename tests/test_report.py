@@ -426,6 +426,13 @@ def test_figures_have_units_and_data(result, recording):
     assert set(labels) == {"true", "estimated, with one SD", "at its bound"}
 
 
+def test_one_offset_far_away_leaves_the_histogram_few_bars(result):
+    offset = 1e-9 * np.arange(20.0)
+    offset[7] = 5.0
+    figure = plot_offsets(dataclasses.replace(result, elevation=jnp.asarray(offset)))
+    assert len(figure.axes[1].patches) == 5
+
+
 def test_convergence_figure_shows_the_excess_over_the_best():
     curves = [*CURVES, Curve("lost", np.full(3, np.nan))]
     stopping = dataclasses.replace(CURVES[1], stopped=1)

@@ -7,6 +7,7 @@ or page (180 mm).
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,8 @@ from jaxcal.runtime.given_values import real_array
 
 COLUMN_MM, PAGE_MM = 88.0, 180.0
 GREY = "#666666"
+_MOST_BINS = 60
+"""Most bars of a histogram."""
 _ROUNDING = 3e-14
 """An excess of the objective below this relative size is only rounding."""
 _ALONG_A_SIDE = 61
@@ -173,7 +176,9 @@ def plot_offsets(calibration: Calibration, truth: Float[np.ndarray, " n"] | None
     # Above the panel: in it, the legend would hide offsets.
     _legend(panel, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3)
     panel.set(xlabel="image", ylabel="elevational offset (mm)")
-    styled(side).hist(offset, bins="fd", orientation="horizontal", color=ORANGE, alpha=0.8)
+    # Bins whose width the middle half decides could be millions with one offset far away.
+    bins = max(5, min(_MOST_BINS, round(math.sqrt(len(offset)))))
+    styled(side).hist(offset, bins=bins, orientation="horizontal", color=ORANGE, alpha=0.8)
     side.set_xlabel("images")
     return figure
 
