@@ -181,6 +181,10 @@ def unchecked(monkeypatch):
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
 
 
+# OpenIGTLink's numbers are float32, which cannot hold this translation.
+FAR = np.eye(4) + np.eye(4, k=3) * 1e300
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -194,6 +198,8 @@ def unchecked(monkeypatch):
         ({"covariance": -np.eye(6)}, "negative variance"),
         ({"range_factor": 0.0}, "range_factor must be positive"),
         ({"face_offset_mm": np.inf}, "face_offset_mm holds NaN or Inf"),
+        ({"image_plane_to_probe": FAR}, "image_plane_to_probe holds a number beyond 1e\\+07"),
+        ({"scale_mm_per_px": (1e300, 0.1)}, "scale_mm_per_px holds a number beyond"),
         ({"unknowns": ("translation", "rotation", "nonsense")}, "unknowns must be"),
         ({"image_covariance": np.eye(5)}, r"must have shape \(6, 6\)"),
     ],

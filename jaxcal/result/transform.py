@@ -25,7 +25,7 @@ import numpy as np
 
 from jaxcal import InputError
 from jaxcal.data.poses import check_affine, check_poses
-from jaxcal.data.recording import check_spacing_unit
+from jaxcal.data.recording import LARGEST, check_spacing_unit
 from jaxcal.io.frame_names import FramePair, probe_name
 from jaxcal.io.given_files import naming
 from jaxcal.model.image_points import point_jacobian
@@ -40,6 +40,8 @@ SaveFormat = Literal["json", "plus", "slicer", "itk", "ros", "tusrec", "numpy"]
 _ROUNDING = 1e-13
 _LARGEST = 1e9
 """Largest pixel; beyond it nothing is an image, and squares overflow."""
+_LENGTHS = ("image_plane_to_probe", "scale_mm_per_px", "face_offset_mm", "range_factor")
+"""What PLUS's matrix is made of, whose numbers other programs take as float32."""
 _UNEQUAL = 1e-6
 """Largest difference between a covariance's two halves, as a share of the SDs' product."""
 _NO_SIZE = 1e-5
@@ -96,7 +98,8 @@ class ImageTransform:
 
     Raises:
         InputError: wrong shapes, ``unknowns`` or ``date``; and, unless ``converged`` is False, NaN
-            or Inf, a matrix that is not rigid, sizes or a ``range_factor`` or ``tre_factor`` that
+            or Inf, lengths beyond :data:`~jaxcal.data.recording.LARGEST`, a matrix that is not
+            rigid, sizes or a ``range_factor`` or ``tre_factor`` that
             are not positive, ``degrees_of_freedom`` or a ``variance_factor`` below 1, a covariance
             that is not symmetric or has negative variances.
     """
@@ -429,6 +432,8 @@ def _checked(values: dict[str, np.ndarray]) -> Float[np.ndarray, "4 4"]:
     for name, array in values.items():
         if name not in ("image_plane_to_probe", "error_mm") and not np.isfinite(array).all():
             raise InputError(f"{name} holds NaN or Inf")
+        if name in _LENGTHS and (np.abs(array) > LARGEST).any():
+            raise InputError(f"{name} holds a number beyond {LARGEST:g}: that cannot be a measure")
         if name in ("scale_mm_per_px", "range_factor", "tre_factor") and not (array > 0).all():
             raise InputError(f"{name} must be positive")
         if name in ("degrees_of_freedom", "variance_factor") and array < 1:
