@@ -20,6 +20,7 @@ import jaxcal
 from jaxcal import InputError
 from jaxcal.diagnostics.intervals import degrees_of_freedom
 from jaxcal.diagnostics.offset_fit import offset_law
+from jaxcal.diagnostics.warnings import _bound_not_kept
 from jaxcal.model.distributions import FAMILIES, UNIFORM
 from jaxcal.model.shapes import tilted
 from jaxcal.solvers.auto import Answers, median, weights
@@ -418,6 +419,9 @@ def test_a_bound_that_the_images_deny_is_named():
     found = [warning for warning in denied.warnings if "the bound on the offsets" in warning]
     assert len(found) == 1
     assert "was not kept: 20 of 20 images" in found[0]
+    # An image that a robust solve leaves out is still in its problem.
+    (said,) = _bound_not_kept(replace(denied, mask=denied.mask.at[0].set(0.0)))
+    assert "was not kept: 19 of 19 images" in said
     kept = jaxcal.calibrate(data, max_elevation=2.5)
     assert not any("bound on the offsets" in warning for warning in kept.warnings)
 

@@ -186,7 +186,8 @@ def _bound_not_kept(result: Calibration) -> list[str]:
     law, problem = result.offset_law, result.problem
     if law is None or bool(law.weighed) or problem is None or problem.max_elevation is None:
         return []
-    used = np.asarray(problem.mask) > 0
+    # The problem's mask has the images that a robust solve left out.
+    used = np.asarray(result.mask) > 0
     size = np.abs(np.asarray(result.elevation))
     beyond = used & (size > np.asarray(problem.max_elevation))
     if not beyond.any():
