@@ -40,11 +40,12 @@ from jaxcal.model.unknowns import (
     stepped,
 )
 from jaxcal.report.accuracy import FAIR_MM, GOOD_MM, region_of, settle
+from jaxcal.report.contradictions import _explanation
 from jaxcal.report.in_memory import record_of, recording_of
 from jaxcal.report.next_poses import next_poses_sentences, pose_records
 from jaxcal.report.record import _precision, calibration_record
 from jaxcal.report.tables import calibration_table
-from jaxcal.report.verdict import headline, limits, verdict
+from jaxcal.report.verdict import certainty, headline, limits, verdict
 from jaxcal.result.calibration import Status
 from jaxcal.result.saved import load_calibration
 from jaxcal.result.transform import ImageTransform
@@ -715,6 +716,26 @@ def test_resampling_that_agrees_changes_nothing(record, left_out):
     assert (changed["verdict"], changed["tre"]["factor"]) == ("good", 1.0)
 
 
+def test_position_and_orientation_have_the_error_of_all_axes(record):
+    covariance = np.diag([0.1, 0.2, 0.2, 0.01, 0.02, 0.02]) ** 2
+    changed = record | {"covariance": covariance.tolist()}
+    said = certainty(changed)[0]
+    assert "root mean square error of the image's position on the probe is 0.30 mm" in said
+    assert "That of its orientation is 1.72 degrees" in said
+
+
+def test_errors_of_either_sign_are_too_large_or_too_small():
+    for kind, value, words in (
+        ("skew", 0.012, "too large by 1.2 % of the depth"),
+        ("skew", -0.012, "too small by 1.2 % of the depth"),
+        ("curve", 0.5, "too long by 0.5 mm 20 mm to either side"),
+        ("curve", -0.5, "too short by 0.5 mm 20 mm to either side"),
+        ("speed", -0.02, "too short by 2.0 %"),
+    ):
+        told, _ = _explanation({"kind": kind, "values": [value], "images": None}, pixels=True)
+        assert words in told
+
+
 def test_limits_in_words(record):
     changed = stating(record, 0.4)
     changed["limits"]["error_share"] = {"lateral": 0.05, "range": 0.25, "elevational": 0.7}
@@ -733,7 +754,12 @@ def test_why_larger_residuals_are_believed(record):
     said = " ".join(verdict({**record, "comparison": beside}))
     assert "larger than that of the conventional fit (1.010 against 0.980 mm)" in said
     assert "an expected error of 0.44 mm, one with weights from these sizes 0.41 mm" in said
-    assert "log density +20.6 +- 5.5" in said
+    assert "predicts held-out images better than the conventional fit (log density +20.6" in said
+    assert "one with weights from these sizes 0.41 mm. " in said
+    # Without the two errors, each fact is still a sentence of its own.
+    said = " ".join(verdict({**record, "comparison": beside | {"tre_mm": None}}))
+    assert "minimises exactly this. This calibration predicts held-out images" in said
+    assert "+- 5.5). In the image, the two calibrations differ by 0.43 mm." in said
 
 
 def test_exit_status_says_less_than_required(tmp_path, capfd):

@@ -54,8 +54,13 @@ def _sd(record: dict[str, Any], kind: str) -> float | None:
 
 
 def _too_long(share: float) -> str:
-    """By how much a length is wrong."""
-    return f"too {'short' if share < 0 else 'long'} by {100 * abs(share):.1f} %"
+    """By how much a length is wrong, as a share of it."""
+    return _too("long", "short", 100 * share, "%")
+
+
+def _too(positive: str, negative: str, size: float, unit: str) -> str:
+    """By how much something is wrong, and in which direction."""
+    return f"too {negative if size < 0 else positive} by {abs(size):.1f} {unit}"
 
 
 def contradictions(record: dict[str, Any]) -> list[tuple[float, str]]:
@@ -229,13 +234,14 @@ def _explanation(found: dict[str, Any], *, pixels: bool) -> tuple[str, str]:
             )
         case "skew":
             return (
-                f"lateral positions that are too large by {100 * values[0]:.1f} % of the depth",
+                f"lateral positions that are {_too('large', 'small', 100 * values[0], '%')} of the "
+                "depth",
                 "a steered beam, or clicks beside the target?",
             )
         case "curve":
             return (
-                f"ranges that are too long by {values[0]:.1f} mm {SIDE_MM:.0f} mm to either side "
-                "of the middle",
+                f"ranges that are {_too('long', 'short', values[0], 'mm')} {SIDE_MM:.0f} mm to "
+                "either side of the middle",
                 "a curved array taken for a straight one, or the delays of another probe?",
             )
         case "speed":

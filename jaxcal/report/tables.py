@@ -84,7 +84,7 @@ def _facts(record: dict[str, Any]) -> list[tuple[str, str]]:
         facts.append(("global minimum", proved))
     if (spread := spread_of_transform(record)) is not None:
         facts.append(
-            ("SD of image_plane_to_probe", f"{_size(spread[0])} mm, {_size(spread[1])} deg")
+            ("RMS error of image_plane_to_probe", f"{_size(spread[0])} mm, {_size(spread[1])} deg")
         )
     facts += further_facts(record)
     sight = record["observability"]

@@ -304,18 +304,25 @@ def believe(record: dict[str, Any]) -> list[str]:
             "With independent Gaussian errors of the estimated sizes (assumed for this comparison "
             "only), a fit with equal weights has an expected error of "
             f"{_mm(beside['conventional_tre_mm'])}, one with weights from these sizes "
-            f"{_mm(beside['tre_mm'])}"
+            f"{_mm(beside['tre_mm'])}."
         )
     gain, sd = beside["log_density_gain"], beside["log_density_gain_sd"]
     if gain is not None and sd is not None:
         better = "better" if gain > 0 else "worse"
-        lines[-1] += f"; it predicts held-out images {better} (log density {gain:+.1f} +- {sd:.1f})"
-    lines[-1] += f". In the image, the two calibrations differ by {_mm(beside['apart_mm'])}."
+        lines.append(
+            f"This calibration predicts held-out images {better} than the conventional fit (log "
+            f"density {gain:+.1f} +- {sd:.1f})."
+        )
+    lines.append(f"In the image, the two calibrations differ by {_mm(beside['apart_mm'])}.")
     return [" ".join(lines)]
 
 
 def spread_of_transform(record: dict[str, Any]) -> tuple[float, float] | None:
-    """SD of X: translation (mm) and rotation (degrees), each over its three axes; or None."""
+    """Root mean square error of X by its covariance, or None.
+
+    It is that of the translation (mm) and of the rotation (degrees), each of all three axes
+    together: the root of the sum of their variances.
+    """
     covariance = record["covariance"]
     if covariance is None:
         return None
@@ -333,8 +340,8 @@ def certainty(record: dict[str, Any]) -> list[str]:
     along = max(range(3), key=lambda axis: record["covariance"][axis][axis])
     about = max(range(3), key=lambda axis: record["covariance"][3 + axis][3 + axis])
     lines = [
-        f"The image's position on the probe has a standard deviation of {_mm(spread[0])}, "
-        f"largest along its {_AXES[along]} axis. That of its orientation is "
+        f"The root mean square error of the image's position on the probe is {_mm(spread[0])} "
+        f"(all three axes), largest along its {_AXES[along]} axis. That of its orientation is "
         f"{spread[1]:{length_form(spread[1])}} degrees, largest about its {_AXES[about]} axis."
     ]
     if record["method"] == "conventional":
