@@ -6,6 +6,7 @@ import numpy as np
 
 from jaxcal.model.unknowns import TABLE, block_slice
 from jaxcal.result.calibration import Calibration, check_one
+from jaxcal.result.diagnostics import ADDITIONS
 from jaxcal.runtime.array_types import AnyArray
 from jaxcal.runtime.arrays import finite_or_none
 
@@ -73,15 +74,15 @@ def poses_to_add(result: Calibration) -> str:
     gain = np.nan_to_num(np.asarray(result.inspection.gain, dtype=float))
     if not gain.max() > 0:
         return "add images with the probe tilted about each of its axes"
-    worth = gain >= WORTH * gain.max()
-    tilts = [name for name, good in zip(TABLE["rotation"].axes, worth[:3], strict=True) if good]
+    worth = dict(zip(ADDITIONS, gain >= WORTH * gain.max(), strict=True))
+    tilts = [name for name in TABLE["rotation"].axes if worth[f"tilt {name}"]]
     parts = []
     if tilts:
         listed = " and ".join([", ".join(tilts[:-1]), tilts[-1]] if tilts[1:] else tilts)
         plural = "axes" if tilts[1:] else "axis"
         parts.append(f"poses tilted by 20 to 30 degrees about the {listed} {plural}")
-    if worth[3]:
+    if worth["depth"]:
         parts.append("images with the target nearer and farther")
-    if worth[4]:
+    if worth["sideways"]:
         parts.append("images with the target farther to both sides")
     return "add " + ", and ".join(parts)

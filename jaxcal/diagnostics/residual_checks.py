@@ -40,7 +40,7 @@ from jaxcal.model.outlying import LEAST_LEFT, robust_sd, stands_out, studentise
 from jaxcal.model.thresholds import FEWEST_IMAGES
 from jaxcal.model.unknowns import block_slice, further_derivatives, measured
 from jaxcal.result.calibration import Calibration
-from jaxcal.result.diagnostics import Inspection
+from jaxcal.result.diagnostics import ADDITIONS, Inspection
 from jaxcal.runtime.array_types import AnyArray, Float
 from jaxcal.solvers.plan import TUNED
 
@@ -235,10 +235,11 @@ def skewness_score(skewness: Float[Array, "*#b"], count: Float[Array, "*#b"]) ->
 def gains(answer: Calibration, seen: ImageErrors, uncertainty: Uncertainty) -> Float[Array, "k 5"]:
     """By how many SDs the weakest direction would change one more image: :attr:`Inspection.gain`.
 
-    The first three kinds are tilts of 25 degrees either way about the image's axes, from the pose
-    nearest to the mean of those in use, with the target at the middle of the used points. The other
-    two have the target at 0.5 or 1.5 times that depth, and 25 mm to either side. In an image whose
-    pose puts the target at q = (x, 0, z), the target moves by -v + [q]x w + M d.
+    The kinds are in the order of :data:`ADDITIONS`. The first three are tilts of 25 degrees either
+    way about the image's axes, from the pose nearest to the mean of those in use, with the target
+    at the middle of the used points. The other two have the target at 0.5 or 1.5 times that depth,
+    and 25 mm to either side. In an image whose pose puts the target at q = (x, 0, z), the target
+    moves by -v + [q]x w + M d.
     """
     blocks, kept = answer.blocks, np.asarray(answer.mask, float)
     count = kept.sum(axis=1)
@@ -278,7 +279,7 @@ def gains(answer: Calibration, seen: ImageErrors, uncertainty: Uncertainty) -> F
         errors[..., 1] -= distance * step[:, column, None]
     sigma = np.maximum(np.asarray(error_sd(answer)), 1e-9)[:, None]
     noticed = np.sqrt(np.sum((errors / sigma) ** 2, axis=2))
-    return noticed.reshape(-1, 5, 2).max(axis=2)
+    return noticed.reshape(-1, len(ADDITIONS), 2).max(axis=2)
 
 
 _TILTS = rotations_from_vectors(np.kron(np.eye(3), [[-TILT_RAD], [TILT_RAD]]))
