@@ -12,9 +12,10 @@ freedom, and then the vector is taken for Student's, with the degrees of freedom
 
     n = (v_1 + v_2)^2 / (v_1^2 / n_1 + v_2^2 / n_2),
 
-where v_1 and v_2 are the two mean squares (Welch 1947, Satterthwaite 1946). n is larger than n_1,
-so Student's variance is smaller for n than for n_1; where the mean square of d_1 has this factor
-(``variance_factor``), the vector's covariance makes up for the difference.
+where v_1 and v_2 are the two mean squares (Welch 1947, Satterthwaite 1946). n is at least the
+smaller of n_1 and n_2, and at most their sum. Where it is larger than n_i, Student's variance is
+smaller for n than for n_i; if the mean square of d_i has this factor (``variance_factor``), the
+covariance of D_i d_i is enlarged to make up for the difference. It is never made smaller.
 """
 
 from __future__ import annotations

@@ -8,11 +8,11 @@ few tenths of a millisecond. Where a corrected fit is far better, the mistake is
 
 *Far better* means two things. Both fits have n images, p unknowns and errors of unknown size. With
 f the sum of squares as given and f' the corrected one, the likelihood ratio is
-(f / f')^((3 n - p) / 2). It must exceed ``ODDS``, so that chance is ruled out although some twenty
-corrections are tried. And f must exceed ``FACTOR`` times f', so that imperfect but correct data are
-not reported. If the images fit badly, poses and points are also shifted by up to half the
-recording, as where they were stamped by two clocks; for these shifts f must exceed ``FARTHER``
-times f'.
+(f / f')^((3 n - p) / 2). It must exceed ``ODDS``, so that chance is ruled out although a dozen
+corrections and two shifts by one row are tried. And f must exceed ``FACTOR`` times f', so that
+imperfect but correct data are not reported. If the images fit badly, poses and points are also
+shifted by up to half the recording, as where they were stamped by two clocks. That is up to six
+hundred shifts at the same ``ODDS``, so for these f must exceed ``FARTHER`` times f'.
 
 What no fit can detect: points that are mirrored (u or v counted from the other side), or swapped
 where both axes have the same or an unknown scale. Eq. 7 knows the image's lateral and axial

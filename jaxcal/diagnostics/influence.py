@@ -19,9 +19,10 @@ V - H_i V - V H_i + R_i C R_i' with the unknowns' covariance C (I - H_i where al
 Within bounds, the part of an error that depends on a free offset is projected out.
 
 *What the residuals say.* S^-1 (sum R_i'(I - H_i)^-1/2 e_i e_i'(I - H_i)^-1/2 R_i + P) S^-1 with
-the priors' information P has the expectation S^-1 if the model holds, and is a valid covariance
-even if it does not: it is larger where a few images pull, or where errors are large in images that
-matter.
+the priors' information P has the covariance of the model as its expectation if the model holds.
+This is S^-1; for conventional fits it is S^-1 (sum v_k S_k + P) S^-1, and the expectation is
+nearly that. The estimate is a valid covariance even if the model does not hold: it is larger where
+a few images pull, or where errors are large in images that matter.
 
 All this is of the errors one by one: S is the information before errors that are alike in
 successive images reduced it (:mod:`jaxcal.calibration.serial_correlation`).
@@ -308,7 +309,7 @@ def excess(found: Influence, weight: Float[Array, "p p"]) -> tuple[float, float]
         weight: W, by which the mean square error is tr(W C).
 
     Returns:
-        tr(W C_residuals) / tr(W S^-1), and its SD if the model holds with Gaussian errors.
+        tr(W C_residuals) / tr(W C) with the covariance C of the model, and its SD if the model holds with Gaussian errors.
     """
     stated = float(np.sum(weight * found.model_covariance))
     if not (np.isfinite(stated) and stated > 0):
