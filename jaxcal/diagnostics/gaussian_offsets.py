@@ -3,8 +3,12 @@
 Offsets that are free within a bound absorb errors that the model leaves out, and hide a wrong
 bound. If the bound is larger than the offsets, all answers in an interval fit equally well; if
 offsets exceed it, the answer is biased. It is also biased if offsets without sharp limits are taken
-to be uniform. If the limits are right, the fit with Gaussian offsets is right as well, only less
-precise, and the answer differs from it by no more than the error of that fit (Hausman 1978).
+to be uniform.
+
+If offsets are uniform and taken to be so, the fit with Gaussian offsets is right as well, only less
+precise, and the answer differs from it by hardly more than the error of that fit (Hausman 1978).
+With the prior ``bounded`` that does not hold: even within the right bound the answer is often less
+accurate than that fit, and differs from it by more (``experiments/sharp_limits.py``).
 """
 
 from __future__ import annotations

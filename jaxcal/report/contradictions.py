@@ -320,8 +320,8 @@ def _from_limits(record: dict[str, Any]) -> list[tuple[float, str]]:
     better = "use the prior auto, unless something limits the offsets on both sides"
     if record["prior"] == "bounded":
         better = (
-            "give the largest distance of the target from the plane as the bound, not more and not "
-            "less, or use the prior auto, which needs no bound"
+            "use the prior auto, which needs no bound (one that is too small or too large moves "
+            "the answer, and even the right one may leave it less accurate)"
         )
     words = (
         f"a calibration with Gaussian offsets differs by {apart:.2f} mm, where its own error would "
