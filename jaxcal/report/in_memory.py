@@ -1,7 +1,8 @@
 """Text, notebook view and record of a calibration in Python.
 
 They are the same as what the command line gives for a recording, but for a calibration in memory,
-from the problem that it holds.
+from the problem that it holds. A problem has no velocities of the probe, so images that lag behind
+their poses are not looked for.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from jaxcal.result.calibration import Calibration, batch_in_words, check_one, da
 
 
 def recording_of(calibration: Calibration) -> Recording:
-    """The data of a calibration, as a recording.
+    """The data of a calibration, as a recording; without velocities, which a problem does not have.
 
     Raises:
         CalibrationError: a calibration without its problem.

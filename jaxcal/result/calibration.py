@@ -543,6 +543,9 @@ class Calibration:
     def record(self, tre_points: tuple[tuple[float, float], ...] = ()) -> dict[str, Any]:
         """What ``jaxcal calibrate --json`` prints, as plain values.
 
+        The command line also looks for images that lag behind their poses. This takes the probe's
+        velocities from the recording, which a calibration does not hold.
+
         Args:
             tre_points: further image points, in the images' unit, for which to give the error.
 
