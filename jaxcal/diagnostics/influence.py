@@ -309,7 +309,8 @@ def excess(found: Influence, weight: Float[Array, "p p"]) -> tuple[float, float]
         weight: W, by which the mean square error is tr(W C).
 
     Returns:
-        tr(W C_residuals) / tr(W C) with the covariance C of the model, and its SD if the model holds with Gaussian errors.
+        tr(W C_residuals) / tr(W C) with the covariance C of the model, and its SD if the model
+        holds with Gaussian errors.
     """
     stated = float(np.sum(weight * found.model_covariance))
     if not (np.isfinite(stated) and stated > 0):
