@@ -28,6 +28,7 @@ from jaxcal.cli.common import (
     segmented,
     verdict_code,
 )
+from jaxcal.report.thresholds import FAIR_MM, GOOD_MM, WIDEST
 from jaxcal.runtime.messages import runs_in_words
 from jaxcal.solvers.names import Data, Method, PriorName, SolverName
 
@@ -194,8 +195,9 @@ def _one_recording(
     type=click.Choice(WORDS),
     default=REQUIRED,
     show_default=True,
-    help="Exit with status 5 if the verdict is worse: good is an error up to 0.5 mm at the image "
-    "(its interval up to 1.5 mm), fair up to 1.5 mm (4.5 mm).",
+    help=f"Exit with status 5 if the verdict is worse: good is an error up to {GOOD_MM:g} mm at "
+    f"the image (its interval up to {WIDEST * GOOD_MM:g} mm), fair up to {FAIR_MM:g} mm "
+    f"({WIDEST * FAIR_MM:g} mm).",
 )
 @click.option("--report", type=click.Path(), metavar="HTML", help="Write a page for a browser.")
 @click.option("--out", type=click.Path(), metavar="DIR", help="Write a report to this folder.")

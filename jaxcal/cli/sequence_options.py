@@ -7,11 +7,12 @@ import os
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import click
 
 from jaxcal.cli.common import POSITIVE, Verbatim
+from jaxcal.data.names import LengthUnit, Orientation, QuaternionOrder
 from jaxcal.runtime.messages import command_line
 
 if TYPE_CHECKING:
@@ -73,7 +74,7 @@ TRACKING = (
     ),
     click.option(
         "--orientation",
-        type=click.Choice(["MF", "UF", "MN", "UN"]),
+        type=click.Choice(get_args(Orientation)),
         help="Orientation of the frames, if their file does not say it.",
     ),
 )
@@ -81,13 +82,13 @@ TRACKING = (
 TABLES = (
     click.option(
         "--pose-units",
-        type=click.Choice(["mm", "cm", "m", "in"]),
+        type=click.Choice(get_args(LengthUnit)),
         help="Unit of translations if the file of the poses does not say it; mm by default. Some "
         "electromagnetic trackers send inches (in).",
     ),
     click.option(
         "--quaternion",
-        type=click.Choice(["xyzw", "wxyz"]),
+        type=click.Choice(get_args(QuaternionOrder)),
         help="Whether a quaternion's scalar is the last or the first of its numbers.",
     ),
     click.option(

@@ -6,6 +6,9 @@ import click
 
 from jaxcal.cli.common import POSITIVE, ExitCode
 
+PORT = 18945
+"""Default port; 18944 is PlusServer's."""
+
 
 @click.command(short_help="Serve a calibration over OpenIGTLink.")
 @click.argument("calibration", type=click.Path(), metavar="CAL")
@@ -18,7 +21,7 @@ from jaxcal.cli.common import POSITIVE, ExitCode
 @click.option(
     "--port",
     type=click.IntRange(0, 65535),
-    default=18945,
+    default=PORT,
     show_default=True,
     metavar="N",
     help="Port to listen at; 0: any free one.",

@@ -10,11 +10,12 @@ Nothing here imports JAX, so that files can be read and converted without its st
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from jaxcal import InputError
+from jaxcal.data.names import QuaternionOrder
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.given_values import real_array
 
@@ -26,9 +27,6 @@ QUATERNION_TOLERANCE = 1e-2
 
 _LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
 _LAST_ROW_TOLERANCE = 1e-6
-
-QuaternionOrder = Literal["xyzw", "wxyz"]
-"""Whether the scalar comes last (ROS, Motive, scipy) or first (NDI)."""
 
 
 def targets_in_images(

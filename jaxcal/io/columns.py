@@ -8,13 +8,11 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import Literal
 
 from jaxcal import FormatError
-from jaxcal.data.poses import QuaternionOrder
+from jaxcal.data.names import QuaternionOrder
 from jaxcal.runtime.messages import quoted
 
-LengthUnit = Literal["mm", "cm", "m", "in"]
 LENGTHS_MM: dict[str, float] = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
 TIMES_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
@@ -50,18 +48,19 @@ CONVERT = (
     "convert them to quaternions (docs/how-to/robot.md shows how)"
 )
 """What to do about a pose of six numbers."""
-_SPELLINGS = {
+SPELLINGS = {
     "mm": ("millimeter", "millimeters", "millimetre", "millimetres"),
     "cm": (),
     "in": ("inch", "inches"),
     "m": ("meter", "meters", "metre", "metres"),
     "px": ("pixel", "pixels"),
-    "s": ("sec", "seconds"),
+    "s": ("sec", "second", "seconds"),
     "ms": (),
     "us": ("µs",),
     "ns": (),
 }
-_UNITS = {name: unit for unit, others in _SPELLINGS.items() for name in (unit, *others)}
+"""Units as other programs write them."""
+_UNITS = {name: unit for unit, others in SPELLINGS.items() for name in (unit, *others)}
 
 
 @dataclass(frozen=True)

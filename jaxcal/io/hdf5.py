@@ -48,6 +48,7 @@ from jaxcal.data.recording import (
     make_images,
 )
 from jaxcal.io.atomic import write_bytes
+from jaxcal.io.columns import SPELLINGS
 from jaxcal.io.given_files import check_readable, naming, path_name
 from jaxcal.io.importing.target_search import FATES, FrameResults
 from jaxcal.io.untrusted import (
@@ -80,9 +81,7 @@ _MOST_GROUPS = 1000
 
 _VELOCITY = "mm/s, rad/s"
 _SPELLINGS = {
-    "mm": ("mm", "millimeter", "millimeters", "millimetre", "millimetres"),
-    "px": ("px", "pixel", "pixels"),
-    "s": ("s", "second", "seconds"),
+    **{unit: (unit, *SPELLINGS[unit]) for unit in ("mm", "px", "s")},
     "mm^2": ("mm^2", "mm2", "mm**2", "mm²"),
     _VELOCITY: (_VELOCITY,),
     "px^2": ("px^2", "px2", "px**2", "px²"),

@@ -10,23 +10,20 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Literal
+from typing import get_args
 
 import numpy as np
 
 from jaxcal import FormatError, InputError
+from jaxcal.data.names import LengthUnit, Orientation
 from jaxcal.data.poses import check_poses, inverse_poses
-from jaxcal.io.columns import LENGTHS_MM, LengthUnit
+from jaxcal.io.columns import LENGTHS_MM
 from jaxcal.io.frame_names import FramePair, path_between
 from jaxcal.io.given_files import naming
 from jaxcal.io.grey import grey_of, oriented
 from jaxcal.io.pixel_stream import Packing, PixelStream
 from jaxcal.runtime.array_types import Bool, Float, Int
 from jaxcal.runtime.messages import quoted
-
-Orientation = Literal["MF", "UF", "MN", "UN"]
-"""Orientation of stored pixels. M or U: a row ends at the marked or the unmarked side. F or N: a
-column ends far from or near to the transducer."""
 
 
 @dataclass(frozen=True)
@@ -258,7 +255,7 @@ class TrackedSequence:
             )
         if pixels.kind != "BRIGHTNESS":
             raise FormatError(f"{self.source}: holds {quoted(pixels.kind)} data, not B-mode images")
-        if stored not in ("MF", "UF", "MN", "UN"):
+        if stored is None or stored not in get_args(Orientation):
             raise FormatError(
                 f"{self.source}: does not say how its pixels are oriented: say it by --orientation "
                 "(MF, UF, MN or UN), as UltrasoundImageOrientation would"

@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from jaxcal import InputError
+from jaxcal.data.names import Orientation
 from jaxcal.io.atomic import write_bytes
 from jaxcal.io.frame_names import FramePair
 from jaxcal.io.given_files import check_readable, naming
 from jaxcal.io.metaimage import check_data_name, metaimage_header, read_metaimage
 from jaxcal.io.nrrd import nrrd_header, read_nrrd
-from jaxcal.io.sequence import Orientation, TrackedSequence
+from jaxcal.io.sequence import TrackedSequence
 from jaxcal.io.sequence_header import check_written, frame_fields, packed_pixels, stacked
 
 EXTENSIONS = (".mha", ".mhd", ".nrrd", ".nhdr")

@@ -14,15 +14,16 @@ import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import cast
+from typing import cast, get_args
 
 import numpy as np
 
 from jaxcal import FormatError, InputError
+from jaxcal.data.names import Orientation
 from jaxcal.io.frame_names import FramePair, check_frames, split_name
 from jaxcal.io.given_files import one_line
 from jaxcal.io.pixel_stream import Packing, PixelStream
-from jaxcal.io.sequence import Orientation, Pixels, TrackedSequence
+from jaxcal.io.sequence import Pixels, TrackedSequence
 from jaxcal.io.table import finite_numbers
 from jaxcal.runtime.messages import quoted
 
@@ -159,7 +160,7 @@ def orientation_and_kind(text: str, kind: str) -> tuple[Orientation | None, str]
         kind = "BRIGHTNESS"
     stated = text.strip().upper()
     # The third letter, the direction of a volume's planes, follows from the others.
-    if re.fullmatch("(MF|UF|MN|UN)[AD]?", stated):
+    if stated[:2] in get_args(Orientation) and stated[2:] in ("", "A", "D"):
         return cast(Orientation, stated[:2]), kind
     if stated not in ("", "XX", "??") and kind == "BRIGHTNESS":
         raise FormatError(

@@ -15,9 +15,6 @@ from jaxcal.io.message_content import Tracked
 from jaxcal.io.openigtlink import Message, encode
 from jaxcal.runtime.array_types import Float
 
-PORT = 18945
-"""Default port; 18944 is PlusServer's."""
-
 MOST_CLIENTS = 32
 _LONGEST_NAME = 20
 _LONGEST_WAIT_S = 60.0
@@ -42,7 +39,7 @@ class TransformServer:
     """
 
     def __init__(
-        self, name: str, matrix: Float[np.ndarray, "4 4"], host: str = "127.0.0.1", port: int = PORT
+        self, name: str, matrix: Float[np.ndarray, "4 4"], host: str = "127.0.0.1", port: int = 0
     ) -> None:
         if not 0 < len(name.encode(errors="replace")) <= _LONGEST_NAME or not name.isprintable():
             raise InputError(

@@ -14,14 +14,14 @@ from typing import Literal
 import numpy as np
 
 from jaxcal import FormatError, InputError
+from jaxcal.data.names import LengthUnit, QuaternionOrder
 from jaxcal.data.poses import (
-    QuaternionOrder,
     check_poses,
     inverse_poses,
     rotations_from_quaternions,
 )
 from jaxcal.data.recording import MINIMUM_IMAGES, Recording, make_images
-from jaxcal.io.columns import CONVERT, LENGTHS_MM, Columns, LengthUnit, columns_of_header
+from jaxcal.io.columns import CONVERT, LENGTHS_MM, Columns, columns_of_header
 from jaxcal.io.given_files import naming
 from jaxcal.io.table import Table, first_line, parse_numbers, read_table
 from jaxcal.runtime.array_types import Float, Int

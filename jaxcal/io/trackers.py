@@ -17,8 +17,8 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxcal import FormatError
+from jaxcal.data.names import LengthUnit
 from jaxcal.data.poses import rotations_from_quaternions
-from jaxcal.io.columns import LengthUnit
 from jaxcal.io.frame_names import FramePair
 from jaxcal.io.given_files import naming
 from jaxcal.io.lines import cells_of, text_lines

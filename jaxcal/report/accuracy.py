@@ -6,8 +6,8 @@ It comes from the covariance, which assumes that the noise model holds. If the d
 (:mod:`jaxcal.report.contradictions`), the expected error is larger, and the larger number is
 reported.
 
-The word of the verdict depends on this number and on the upper end of its interval: good up to
-0.5 mm (at most 1.5 mm), fair up to 1.5 mm (at most 4.5 mm), otherwise uncertain.
+The word of the verdict (good, fair or uncertain) depends on this number and on the upper end of its
+interval (:mod:`jaxcal.report.thresholds`).
 """
 
 from __future__ import annotations
@@ -31,22 +31,12 @@ from jaxcal.diagnostics.outlier_agreement import agreeing_outliers, apart_in_ima
 from jaxcal.diagnostics.unmodelled import unmodelled
 from jaxcal.model.image_points import mean_of_squares
 from jaxcal.report.contradictions import contradictions
+from jaxcal.report.thresholds import FAIR_MM, GOOD_MM, WIDEST
 from jaxcal.result.calibration import Calibration
 from jaxcal.result.saved import ASKED_FOR
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.given_values import real_array
 from jaxcal.solvers.closed_form.single import in_closed_form, solve_problem
-
-GOOD_MM = 0.5
-"""Largest error to expect at the image (root mean square) that is called good."""
-FAIR_MM = 1.5
-"""Largest error that is called fair; larger ones are called uncertain."""
-WIDEST = 3.0
-"""Largest upper end of the interval for either word, as a multiple of the word's largest error.
-
-Of few images, whose errors tell little about their own size, the interval is many times as wide as
-the error: such a number is no answer, however small it is.
-"""
 
 _ACROSS = 15
 """Number of points along each side of the map."""

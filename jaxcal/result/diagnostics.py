@@ -14,7 +14,7 @@ Array = np.ndarray
 MISFITS = ("tails", "skewness", "depth", "drift", "trend")
 """Rows of ``misfit``."""
 
-ADDITIONS = ("tilt lateral", "tilt elevational", "tilt axial", "depth", "sideways")
+ADDITIONS: tuple[str, ...] = ("tilt lateral", "tilt elevational", "tilt axial", "depth", "sideways")
 """Kinds of further images: tilted about an image axis, or with the target elsewhere in them."""
 
 

@@ -8,11 +8,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 from jaxcal import FormatError, InputError
-from jaxcal.data.poses import QuaternionOrder
+from jaxcal.data.names import LengthUnit, Orientation, QuaternionOrder
 from jaxcal.data.recording import MINIMUM_IMAGES
-from jaxcal.io.columns import LengthUnit
 from jaxcal.io.folder import read_folder
-from jaxcal.io.sequence import Orientation, TrackedSequence
+from jaxcal.io.sequence import TrackedSequence
 from jaxcal.io.sequence_files import EXTENSIONS, read_sequence
 from jaxcal.io.slicer import EXTENSIONS as MARKUPS
 from jaxcal.io.text import PoseTable, read_pose_table
