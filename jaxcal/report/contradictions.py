@@ -3,7 +3,7 @@
 The covariance assumes that the noise model holds. It is contradicted if
 
 - the residuals are larger than a beam is thick (10 mm);
-- the residuals make the error larger than stated by more than three SDs of chance;
+- the residuals make the error larger than their SDs do by more than three SDs of chance;
 - leaving one image out moves image points by more than half the stated error and by more than four
   times the expected move (by one step from the normal equations, or by cross-validation if this was
   requested);
@@ -96,11 +96,17 @@ def _from_large_residuals(record: dict[str, Any]) -> list[tuple[float, str]]:
 
 
 def _from_residuals(record: dict[str, Any]) -> list[tuple[float, str]]:
+    """Residuals that are too large where they matter, one by one.
+
+    They are compared with what their SDs make of the error, before errors that are alike in
+    successive images and doubt about the offsets' distribution widen the covariance. The factor is
+    applied to the wider error, since neither of the two is seen in single residuals.
+    """
     tre = record["tre"]
     ratio, chance = tre["residuals_over_stated"], tre["chance"]
     if ratio is None or chance is None or ratio**2 <= 1 + CHANCE * chance:
         return []
-    words = f"the residuals make the error {ratio:.1f} times as large as the covariance does"
+    words = f"the residuals make the error {ratio:.1f} times as large as their SDs do"
     return [(ratio, words)]
 
 
