@@ -103,6 +103,22 @@ def test_a_calibration_by_another_method_is_refused(data, whole):
         bootstrap(data, 100_000, result=other, **CONVENTIONAL)
 
 
+def test_images_in_use_are_dealt_to_the_folds(data):
+    """Dealt by their places, every third image would all come into one fold."""
+    third = replace(data, mask=(jnp.arange(COUNT) % 3 == 0).astype(float))
+    used = np.flatnonzero(third.mask)
+    found = cross_validate(third, folds=3, **CONVENTIONAL)
+    assert np.asarray(found.converged).tolist() == [1, 1, 1]
+    assert len(np.unique(np.round(found.image_to_probe, 9), axis=0)) == 3
+    moved = np.asarray(found.image_moved)
+    for fold in range(3):
+        together = moved[used[fold::3]]
+        np.testing.assert_array_equal(together, together[0])
+    assert len(cross_validate(third, **CONVENTIONAL).converged) == len(used)
+    with pytest.raises(jaxcal.InputError, match="folds must be between 2 and 7, not 8"):
+        cross_validate(third, folds=8, **CONVENTIONAL)
+
+
 @pytest.mark.slow
 def test_folds_and_masked_images(data):
     masked = replace(data, mask=data.mask.at[3].set(0.0))

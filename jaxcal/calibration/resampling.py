@@ -134,8 +134,9 @@ def cross_validate(
 
     Args:
         problem: one problem, a recording, or one set of images.
-        folds: image i belongs to fold i mod folds; by default every image is a fold of its own, up
-            to :data:`MOST_FOLDS`.
+        folds: the images in use are dealt to so many folds in turn; by default every image is a
+            fold of its own, up to :data:`MOST_FOLDS`. Inside a transformation, where nobody knows
+            yet which images are in use, all are dealt.
         result: the calibration of all images, if it exists already: by the same method, with the
             same prior, data and unknowns. Images that it left out as outliers are neither used nor
             held out.
@@ -145,16 +146,21 @@ def cross_validate(
         Errors of the held-out images, and how much each image moves X: a :class:`CrossValidation`.
 
     Raises:
-        InputError: too few images, folds that are not from 2 to the number of images, options that
-            contradict each other, or a result by another method than they ask for.
+        InputError: too few images, folds that are not from 2 to the number of images in use,
+            options that contradict each other, or a result by another method than they ask for.
         CalibrationError: this process was forked from one in which JAX had started.
     """
     problem, plan, arguments = _one_problem(problem, arguments, "jaxcal.cross_validate")
     count = problem.images
-    folds = min(count, MOST_FOLDS) if folds is None else whole_number("folds", folds, 2, count)
+    if folds is not None:
+        folds = whole_number("folds", folds, 2, count)
     given, result = problem, _full_calibration(problem, result, plan, arguments)
     problem, xp = _used(problem, result)
-    fold = np.arange(count) % folds
+    used = problem.mask > 0 if xp is np else np.ones(count, bool)
+    several = int(used.sum())
+    folds = min(several, MOST_FOLDS) if folds is None else whole_number("folds", folds, 2, several)
+    # Images that are not in use belong to the fold of the one before them, and change nothing.
+    fold = np.maximum(np.cumsum(used) - 1, 0) % folds
     rest = fold != np.arange(folds)[:, None]
     _check_remaining(problem.mask, rest)
 

@@ -115,7 +115,7 @@ def _from_images(record: dict[str, Any]) -> list[tuple[float, str]]:
     stated, influence = record["tre"]["stated_mm"], record["influence"]
     held = record.get("cross_validation")
     moved, how = influence["moved_mm"], "to first order"
-    if held is not None and held["folds"] == len(moved):
+    if held is not None and held["folds"] == len(_each_used(held)):
         moved, how = held["image_moved_mm"], "by a calibration without it"
     found = [
         (by, image)
@@ -344,17 +344,20 @@ def _scatter(scatter: float, stated: float) -> str:
     )
 
 
+def _each_used(held: dict[str, Any]) -> list[float]:
+    """By how much leaving out each image in use (its fold) changes the answer, mm."""
+    return [by for by in held["image_moved_mm"] if by is not None]
+
+
 def _from_resampling(record: dict[str, Any]) -> list[tuple[float, str]]:
     found: list[tuple[float, str]] = []
     held, drawn = record.get("cross_validation"), record.get("bootstrap")
     if held is not None and held["folds"] == held["folds_converged"]:
-        # The jackknife. All images of a fold are held out together; some folds may hold none that
-        # is in use.
-        moved = {
-            k % held["folds"]: by for k, by in enumerate(held["image_moved_mm"]) if by is not None
-        }
-        folds, stated = max(len(moved), 1), held["stated_mm"]
-        scatter = math.sqrt((folds - 1) / folds * sum(by**2 for by in moved.values()))
+        # The jackknife. All images of a fold are held out together; the first ones in use are of a
+        # fold each.
+        folds, stated = held["folds"], held["stated_mm"]
+        moved = _each_used(held)[:folds]
+        scatter = math.sqrt((folds - 1) / folds * sum(by**2 for by in moved))
         if stated and scatter > SCATTER_TIMES * stated:
             words = f"the calibrations of the cross-validation {_scatter(scatter, stated)}"
             found.append((scatter / stated, words))
