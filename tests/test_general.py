@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import conftest
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -267,6 +268,20 @@ def test_what_the_pieces_cannot_take_is_said_in_a_sentence():
     ):
         with pytest.raises(jaxcal.InputError, match=said):
             call()
+
+
+def test_other_solvers_tune_sds_in_float32():
+    """Its last digits change for ever; 60 solves were the end of it."""
+    problem, precision = conftest.problem(3, images=20), "float32"
+    given = jaxcal.Options(solver=LevenbergMarquardt(), precision=precision)
+    found = jaxcal.calibrate(problem, prior="gaussian", options=given)
+    exact = jaxcal.calibrate(problem, prior="gaussian")
+    assert found.converged
+    assert found.variance_rounds < 20
+    np.testing.assert_allclose(found.sigma, exact.sigma, rtol=1e-2)
+    given = jaxcal.Options(solver=optx.Dogleg(1e-5, 1e-5), precision=precision)
+    with pytest.raises(jaxcal.InputError, match="Dogleg does not run in float32"):
+        jaxcal.calibrate(problem, prior="gaussian", options=given)
 
 
 def test_local_unknowns_reach_their_minimum_where_the_shared_gradient_is_zero():

@@ -210,7 +210,8 @@ def _covariance(
         # What the Gaussian solution cannot determine at all stays unknown.
         better = averaged.law.weighed[..., None, None] & jnp.isfinite(covariance)
         covariance = jnp.where(better, jnp.moveaxis(averaged.covariance, -1, 0), covariance)
-    # Three images are fitted exactly, so what the residuals tell of the errors is nearly zero.
+    # A finite covariance would be false where the poses do not determine the unknowns, or without
+    # a solve.
     known = (status != Status.UNOBSERVABLE) & (status != Status.FAILED)
     return jnp.where(known[..., None, None], covariance, jnp.nan)
 

@@ -99,7 +99,7 @@ def _with_uncertainty(found: ClosedForm, problem: Problem, plan: SolvePlan) -> C
         image_to_probe=found.image_to_probe,
         point=found.point_mm,
         elevation=np.where(seen.mask[0] > 0, seen.q[0, :, 1], 0.0),
-        # Each with n less a third of the unknowns.
+        # Every kind of errors has n - p/3 degrees of freedom.
         sigma=np.sqrt(
             (seen.errors[0] ** 2).sum(axis=0) / max(used - count_unknowns(blocks) / 3, 1)
         ),

@@ -23,9 +23,10 @@ out.
 residuals of the conventional fit (closed form, :mod:`jaxcal.solvers.closed_form.single`) have an
 integrated autocorrelation time t, and n images are worth n / t independent ones. Where t reaches
 ``LEAST_STREAM_TIME`` images and chance does not explain it, images are left out at equal intervals.
-``KEPT_OF_TIME`` of a time t are kept, and ``KEPT_OF_STREAM`` of a whole stream, since the
-correlation that remains widens the covariance (:mod:`jaxcal.calibration.serial_correlation`), and
-does so better the more images show it. Where it cannot, one of a time t is kept.
+At least ``KEPT_OF_TIME`` of every time t are kept, and ``KEPT_OF_STREAM`` of a whole stream, since
+the correlation that remains widens the covariance
+(:mod:`jaxcal.calibration.serial_correlation`), and does so better the more images show it. Where it
+cannot, one of a time t is kept.
 
 References: Wiles, Thompson and Frantz 2004 (accuracy of optical trackers); Sokal 1997,
 section 3 (integrated autocorrelation time); Liang and Zeger 1986 (clustered data).
@@ -70,8 +71,10 @@ LEAST_STREAM_TIME = 4.0
 """Least autocorrelation time of a stream, in images."""
 
 KEPT_OF_TIME, KEPT_OF_STREAM = 2.5, 60
-"""With fewer images errors are larger, and intervals do not hold more often; with all images of a
-stream intervals are too short (``experiments/stream_images.py``)."""
+"""Least number of images that are kept of an autocorrelation time, and of a whole stream. With
+fewer images errors are larger, and intervals do not hold more often; with all images of a stream
+intervals are too short (``experiments/stream_images.py``)."""
+
 STREAM_SCORE = 5.0
 """In a stream the correlation of successive errors is more than so many SDs above zero."""
 

@@ -351,8 +351,8 @@ def relative_twist(
 ) -> Float[AnyArray, "*k 6"]:
     """[v, omega] that take the first transform to the second: first Exp([v, omega]), mm and rad.
 
-    It is exact for v. For omega the error is of third order, since a calibration moves by fractions
-    of a degree.
+    It is exact for v. The error of omega is of third order; a calibration moves by fractions of a
+    degree, so it does not count.
     """
     xp = array_module(first, second)
     back = first[:3, :3].T

@@ -382,7 +382,7 @@ def _unit(images: ImagePlanes) -> Float[Array, "1 batch"]:
 
 
 def on_circle(q: Vector, y: Array, further: FurtherUnknowns, images: ImagePlanes) -> Vector:
-    """Q - p(y), mm: the residuals of Eq. 7 at a given offset."""
+    """Residuals q - p(y) of Eq. 7 at a given offset, mm; NaN where it exceeds the range."""
     lateral, distance = further.points(images)
     return [q[0] - lateral, q[1] - y, q[2] - root(distance * distance - y * y)]
 

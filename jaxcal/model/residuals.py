@@ -59,7 +59,7 @@ def circle_residual(
 
     Args:
         parameters: X, target and further unknowns.
-        elevation: the offsets y_i, mm.
+        elevation: the offsets y_i, mm; where one exceeds the image's range, its row is NaN.
         problem: the data.
 
     Raises:

@@ -265,7 +265,7 @@ class Calibration:
 
     @property
     def variance_rounds(self) -> Int[AnyArray, "*batch"]:
-        """Variance updates of the self-tuning; 0 without."""
+        """Passes of the self-tuning that updated the SDs; 0 without it."""
         return self.convergence.variance_rounds
 
     @property

@@ -145,7 +145,7 @@ def computed_once(make: Callable[[], T], witness: ArrayLike) -> T:
         make: without arguments; what it closes over may be traced.
         witness: a number that is not negative. To have an effect, it must be an argument of the
             program and the same for the whole batch. If it is negative or NaN, everything is NaN,
-            which nobody mistakes for an answer.
+            so that a caller cannot mistake it for a result.
 
     Returns:
         The same arrays as ``make()``, which have to be floating or complex.

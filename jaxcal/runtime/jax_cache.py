@@ -98,7 +98,11 @@ def _remove_damaged(place: Path) -> None:
 
 def prune(place: Path, kept: int = KEPT_PROGRAMS) -> None:
     """Remove all but the newest entries."""
-    # Not stat: a link that leads nowhere would end it, and nothing would be removed any more.
-    programs = sorted(place.iterdir(), key=lambda path: path.lstat().st_mtime)
-    for path in programs[: max(len(programs) - kept, 0)]:
+    programs = []
+    for path in place.iterdir():
+        with suppress(FileNotFoundError):  # another process prunes as well
+            # Not stat: a link that leads nowhere would end it, and nothing would be removed any
+            # more.
+            programs.append((path.lstat().st_mtime, path))
+    for _, path in sorted(programs)[: max(len(programs) - kept, 0)]:
         path.unlink(missing_ok=True)

@@ -15,7 +15,7 @@ class Convergence:
         stationarity: scaled KKT residual of that objective.
         tolerance_met: the method's own stopping rule was met.
         iterations: linearisations (joint, conventional) or rounds (alternating).
-        variance_rounds: variance updates of the self-tuning; 0 without.
+        variance_rounds: passes of the self-tuning that updated the SDs; 0 without it.
         searched_start: the closed-form start was unsound, so a search found another start.
         sigma_floored: which SDs are at their floor.
         rotation_change: X's last move in rad (alternating), else 0.

@@ -38,6 +38,7 @@ from jaxcal.runtime.array_types import AnyArray
 from jaxcal.runtime.arrays import is_traced
 from jaxcal.runtime.given_values import real_array, whole_number
 from jaxcal.solvers.levenberg_marquardt import (
+    CONVERGED_WITHIN,
     LARGEST_DAMPING,
     MOST_STALLED,
     Descent,
@@ -46,7 +47,7 @@ from jaxcal.solvers.levenberg_marquardt import (
     iterate_once,
 )
 from jaxcal.solvers.normal_equations import NormalEquations
-from jaxcal.solvers.plan import MOST_STEPS
+from jaxcal.solvers.plan import MOST_STEPS, check_size
 
 
 class Local(eqx.Module):
@@ -111,9 +112,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         if self.tolerance is not None:
             given["tolerance"] = self.tolerance
         for name, value in given.items():
-            known = isinstance(value, int | float) and value >= 0
-            if not (known or isinstance(value, jax.Array)):
-                raise InputError(f"{name} must be a number of at least 0, not {value!r}")
+            check_size(name, value, 0.0, unit="")
 
     def _least_cosine(self, dtype: jnp.dtype) -> float:
         return default_tolerance(dtype) if self.tolerance is None else self.tolerance
@@ -141,6 +140,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         here = descent.candidate.shared
         normal, beside = _normal(residual, here[:, 0])
         tolerance = self._least_cosine(here.dtype)
+        # optimistix counts the steps.
         after = iterate_once(
             descent, lambda iterate, exact: normal, rounding, tolerance, 2**30, exact_below=0.0
         )
@@ -276,6 +276,7 @@ class _ArrowSolver(LevenbergMarquardt):
         # The candidate's own derivatives say how its local unknowns follow the next step.
         descent = eqx.tree_at(lambda state: state.candidate, descent, candidate)
         tolerance = self._least_cosine(here.shared.dtype)
+        # optimistix counts the steps.
         after = iterate_once(
             descent, lambda iterate, exact: normal, rounding, tolerance, 2**30, exact_below=0.0
         )
@@ -283,13 +284,14 @@ class _ArrowSolver(LevenbergMarquardt):
         # A step knows of the shared unknowns' gradient alone. Where that is zero, the local ones
         # may be far from their minimum still.
         still = iterate.local.cosine
-        stopped = (after.stalled >= MOST_STALLED) | (after.damping > LARGEST_DAMPING)
+        stalled = after.stalled >= MOST_STALLED
+        stopped = stalled | (after.damping > LARGEST_DAMPING)
         after = eqx.tree_at(
             lambda state: (state.active, state.converged),
             after,
             (
                 after.active | (still > tolerance) & jnp.logical_not(stopped),
-                after.converged & ((still <= 10 * tolerance) | (after.stalled >= MOST_STALLED)),
+                after.converged & ((still <= CONVERGED_WITHIN * tolerance) | stalled),
             ),
         )
         return (iterate.shared[:, 0], iterate.local.value[:, 0]), (after, rounding, aux), aux

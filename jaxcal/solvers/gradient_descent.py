@@ -23,6 +23,9 @@ from jaxcal.model.observations import FurtherUnknowns, InPlane
 from jaxcal.solvers.plan import Options
 from jaxcal.solvers.with_optimistix import Fit
 
+STEPS_PER_ITERATION = 100
+"""Most steps for each of ``Options.max_iterations``: they cost little, and thousands are needed."""
+
 
 class SteepestDescent(optx.AbstractGradientDescent):
     """optimistix's gradient descent with an Armijo search in place of a fixed step."""
@@ -73,7 +76,7 @@ def pairwise_gradient(start: Iterate, images: ImagePlanes, options: Options) -> 
     def cost(tangent: Float[Array, " 6"], _: None) -> Float[Array, ""]:
         iterate = moved(tangent)
         away = reconstructed(iterate, images) - target(iterate)[..., None]
-        # The mean over pairs in units of the lever arm: an objective of order one.
+        # The mean square distance from the mean, in units of the lever arm: of order one.
         return jnp.sum(images.mask * away**2) / jnp.sum(count * lever**2)
 
     solver = SteepestDescent(
@@ -83,7 +86,7 @@ def pairwise_gradient(start: Iterate, images: ImagePlanes, options: Options) -> 
         descent=optx.SteepestDescent(),
         search=optx.BacktrackingArmijo(step_init=1.0),
     )
-    steps = 100 * options.max_iterations
+    steps = STEPS_PER_ITERATION * options.max_iterations
     found = optx.minimise(cost, solver, jnp.zeros(6, lever.dtype), max_steps=steps, throw=False)
     iterate = moved(found.value)
     iterate = eqx.tree_at(lambda it: it.point, iterate, target(iterate))

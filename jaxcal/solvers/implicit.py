@@ -29,7 +29,8 @@ from jaxcal.solvers import dense, reml
 from jaxcal.solvers.normal_equations import accumulate
 
 STILL_MM, STILL_RAD = 1e-6, 1e-8
-"""Largest tolerances of an alternation that ends near enough to the minimum."""
+"""Largest tolerances with which an alternation stops near enough to the minimum to have
+derivatives."""
 
 
 @jax.custom_jvp

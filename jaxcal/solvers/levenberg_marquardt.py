@@ -5,13 +5,13 @@ answer while the others go on. An iteration evaluates every problem's candidate:
 whether the candidate is taken, and the same sums are the normal equations for the next one. The
 first candidate is the start, so that only one loop body has to be compiled.
 
-The acceptance rule is that of More (1978) with Nielsen's (1999) constants: a step is taken where
-the cost falls by at least a ten-thousandth of the decrease that the quadratic model predicts. The
-damping falls where the cost falls by at least a quarter of it, and grows tenfold where a step is
-refused. Every loop of the package uses this rule, by :meth:`LoopState.judged`. Steps are
-Gauss-Newton's where the gradient cosine is above :data:`EXACT_BELOW`, and exact Newton steps below
-it; where the exact matrix is indefinite, the same iterate is evaluated again without second
-derivatives.
+The acceptance rule is that of More (1978), with Marquardt's (1963) factors on the damping: a step
+is taken where the cost falls by at least a ten-thousandth of the decrease that the quadratic model
+predicts. The damping falls where the cost falls by at least a quarter of it, and grows tenfold
+where a step is refused. Every loop of the package uses this rule, by :meth:`LoopState.judged`.
+Steps are Gauss-Newton's where the gradient cosine is above :data:`EXACT_BELOW`, and exact Newton
+steps below it; where the exact matrix is indefinite, the same iterate is evaluated again without
+second derivatives.
 
 A problem stops when the largest cosine between its residual and a column of its Jacobian is below
 the tolerance, when its residuals are nothing but rounding, or when steps gain no more than
@@ -21,8 +21,8 @@ last step is taken, and its result is not evaluated.
 The loop needs normal equations and a retraction, not residuals; :mod:`jaxcal.solvers.general` puts
 it behind optimistix's interface for residuals of any shape.
 
-References: More, "The Levenberg-Marquardt algorithm: implementation and theory", 1978; Nielsen,
-"Damping parameter in Marquardt's method", 1999.
+References: Marquardt, "An algorithm for least-squares estimation of nonlinear parameters", 1963;
+More, "The Levenberg-Marquardt algorithm: implementation and theory", 1978.
 """
 
 from __future__ import annotations
@@ -64,6 +64,13 @@ it. From a cosine below 1e-6, the worst of 1,024 simulated problems came to 2.3e
 FINAL_DECREASE = 1e-11
 """Largest predicted relative decrease of the cost by a last step that is not evaluated."""
 
+LITTLE_DAMPING = 1e-6
+"""Damping below which a step counts as Newton's own."""
+
+CONVERGED_WITHIN = 10.0
+"""A problem that is given up with a cosine within this many tolerances has converged: what is left
+of its way is far below its SDs."""
+
 MOST_STALLED = 4
 """Successive steps without a gain above rounding after which a problem has converged."""
 
@@ -80,8 +87,8 @@ class Minimum(eqx.Module):
         cost: sum of squared (whitened) residuals; without a last step that was not evaluated.
         cosine: gradient cosine max_k |g_k| / (|J_k| |r|); after such a step, its bound.
         iterations: number of evaluations (of a solver of optimistix: its steps).
-        converged: the gradient cosine met its tolerance, or steps gain nothing above rounding. Of
-            other methods: their own rule is met.
+        converged: the gradient cosine met its tolerance (:data:`CONVERGED_WITHIN`), or steps gain
+            nothing above rounding. Of other methods: their own rule is met.
         trace: best cost after each of the first evaluations; NaN beyond the last; None: not kept.
     """
 
@@ -308,7 +315,7 @@ def iterate_once(
     squared_cosine = QUADRATIC_FACTOR * cosine * cosine
     final_step = (
         (state.exact_next > 0)
-        & (damping < 1e-6)
+        & (damping < LITTLE_DAMPING)
         & jnp.logical_not(retry)
         & (squared_cosine <= tolerance)
         & (predicted <= FINAL_DECREASE * cost)
@@ -327,7 +334,7 @@ def iterate_once(
         predicted=predicted,
         stalled=stalled,
         iterations=iterations,
-        converged=(cosine <= 10 * tolerance) | final_step | (stalled >= MOST_STALLED),
+        converged=(cosine <= CONVERGED_WITHIN * tolerance) | final_step | (stalled >= MOST_STALLED),
         active=(cosine > tolerance) & jnp.logical_not(stopped | final_step),
         trace=recorded(state.trace, state.iterations, cost),
     )

@@ -146,7 +146,8 @@ def run(
         assert isinstance(found, SelfTuned | Fit)
         observation = observation.with_sigma(found.updated)
         floored = on_floor(found.updated).T[:, [*observation.error_sd]]
-        rounds = found.iterations
+        # Every pass of the package's own solver updates the SDs.
+        rounds = found.rounds if isinstance(found, Fit) else found.iterations
     moves = (jnp.zeros_like(found.cost),) * 2
     if isinstance(found, Alternation):
         moves = (found.rotation_change, found.translation_change)

@@ -10,8 +10,9 @@ and not a choice between the two: every answer moves continuously with the data,
 do not tell whether there is a mean, the covariance includes that doubt. With v = (2 s_y)^2 and the
 data's likelihood of b, all other unknowns eliminated, proportional to exp(eta b - lambda b^2 / 2),
 
-    ln odds = ln(1/9) + 1/2 v eta^2 / (1 + v lambda) - 1/2 ln(1 + v lambda),
-    p = odds / (1 + odds),   m = v eta / (1 + v lambda),   w = v / (1 + v lambda),
+    ln BF = 1/2 v eta^2 / (1 + v lambda) - 1/2 ln(1 + v lambda),
+    ln odds = ln(1/9) + ln BF,   p = odds / (1 + odds),
+    m = v eta / (1 + v lambda),   w = v / (1 + v lambda),
     E b = p m,               var b = p w + p (1 - p) m^2.
 
 *Trust.* lambda is right if the errors are as the model assumes: Gaussian, alike, independent. The
@@ -69,17 +70,17 @@ class MeanBelief(eqx.Module):
     Attributes:
         mean: expectation, mm.
         variance: mm^2.
-        log_odds: ln of how much more probable the data are with a mean than without one.
+        log_bayes_factor: ln of how much more probable the data are with a mean than without one.
     """
 
     mean: Float[Array, "*batch"]
     variance: Float[Array, "*batch"]
-    log_odds: Float[Array, "*batch"]
+    log_bayes_factor: Float[Array, "*batch"]
 
     @property
     def probability(self) -> Float[Array, "*batch"]:
         """Probability that there is a mean other than zero."""
-        return jax.nn.sigmoid(self.log_odds + log(PROBABILITY / (1 - PROBABILITY)))
+        return jax.nn.sigmoid(self.log_bayes_factor + log(PROBABILITY / (1 - PROBABILITY)))
 
 
 def mean_belief(mean: Array, variance: Array, offset_sd: Array, trust: Array) -> MeanBelief:
@@ -96,16 +97,16 @@ def mean_belief(mean: Array, variance: Array, offset_sd: Array, trust: Array) ->
     pull = trust * mean / variance
     known = 1 + prior * precision
     within = prior / known
-    log_odds = 0.5 * (within * pull**2 - jnp.log(known))
-    belief = MeanBelief(within * pull, within, log_odds)
+    log_bayes_factor = 0.5 * (within * pull**2 - jnp.log(known))
+    belief = MeanBelief(within * pull, within, log_bayes_factor)
     p = belief.probability
     spread = p * (within + (1 - p) * belief.mean**2)
-    return MeanBelief(p * belief.mean, spread, log_odds)
+    return MeanBelief(p * belief.mean, spread, log_bayes_factor)
 
 
 def log_evidence_gain(belief: MeanBelief) -> Array:
     """Ln of the evidence over that under the assumption that there is a mean."""
-    return jnp.logaddexp(log(PROBABILITY), log(1 - PROBABILITY) - belief.log_odds)
+    return jnp.logaddexp(log(PROBABILITY), log(1 - PROBABILITY) - belief.log_bayes_factor)
 
 
 def influences(

@@ -58,7 +58,8 @@ class Options:
         tolerance_mm: see ``tolerance_rad``; mm.
         max_rounds: most rounds of the alternation.
         inner_steps: Gauss-Newton steps on X and c in each round of the alternation.
-        max_iterations: most linearisations of the other solvers.
+        max_iterations: most linearisations of the other solvers; ``gradient`` takes at most a
+            hundred steps for each of them.
         trace: how many values of the objective to keep in the result.
         differentiate: False if the answer will not be differentiated. Inside a caller's grad it is
             then a constant, and derivatives are neither traced nor compiled.

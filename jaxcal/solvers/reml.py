@@ -329,7 +329,7 @@ def self_tuned(
         enough=enough,
         coordinates=coordinates,
         cosine_tolerance=cosine_tolerance,
-        sigma_tolerance=10 * cosine_tolerance if cosine_tolerance < 1e-9 else cosine_tolerance,
+        sigma_tolerance=sigma_tolerance(images.mask.dtype),
         max_steps=max_steps,
     )
     # Infinite SDs leave out exact second derivatives.
@@ -351,6 +351,11 @@ def self_tuned(
     return until_done(
         lambda state, tuning: tuning.iterate_once(state), begun, tuning, lambda s: s.active
     )
+
+
+def sigma_tolerance(dtype: jnp.dtype) -> float:
+    """Relative change of the SDs at which they are tuned, in the arithmetic of ``dtype``."""
+    return 1e-9 if float(jnp.finfo(dtype).eps) < 1e-10 else 1e-4
 
 
 def update_at(

@@ -63,8 +63,8 @@ class ConventionalStart(eqx.Module):
     @classmethod
     def of(cls, start: Start, blocks: Blocks) -> ConventionalStart:
         """From the closed forms' minima, with a leading axis."""
-        plain = jax.vmap(Parameters.of)(start.rotation, start.translation, start.point, start.scale)
-        parameters = replace(plain, sound_speed=start.sound_speed)
+        places = start.rotation, start.translation, start.point, start.scale
+        parameters = jax.vmap(Parameters.of)(*places)
         return cls(None, Iterate.of(parameters, blocks), start.searched)
 
 

@@ -11,8 +11,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
+from jaxcal import InputError
 from jaxcal.model.batch import ImagePlanes, Iterate, choose, targets
 from jaxcal.model.observations import FurtherUnknowns, MediumPrior, Observation
 from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
@@ -20,10 +21,7 @@ from jaxcal.runtime.compiler import traced_once
 from jaxcal.solvers.levenberg_marquardt import Minimum, Rounding, empty_trace, gradient_cosine
 from jaxcal.solvers.normal_equations import accumulate, component_sums, weight_of
 from jaxcal.solvers.plan import Options
-from jaxcal.solvers.reml import update_at, with_floor
-
-TOLERANCE = 1e-9
-"""Relative change of the SDs at which they are tuned."""
+from jaxcal.solvers.reml import sigma_tolerance, update_at, with_floor
 
 MOST_UPDATES = 60
 """Most updates of the SDs."""
@@ -34,9 +32,11 @@ class Fit(Minimum):
 
     Attributes:
         updated: SDs after the last update, mm; those given where none are tuned.
+        rounds: number of solves with other SDs; 0 where none are tuned.
     """
 
     updated: Float[Array, "k batch"]
+    rounds: Int[Array, " batch"]
 
     @classmethod
     def of(
@@ -60,6 +60,7 @@ class Fit(Minimum):
             converged=(found.result == optx.RESULTS.successful)[None],
             trace=empty_trace(trace, normal.cost),
             updated=observation.sigma,
+            rounds=jnp.zeros((1,), jnp.int32),
         )
 
 
@@ -89,16 +90,28 @@ def minimise_with(
     medium: MediumPrior | None,
     options: Options,
 ) -> Fit:
-    """Minimise the objective of one problem, a batch of one."""
+    """Minimise the objective of one problem, a batch of one.
+
+    Raises:
+        InputError: float32 and a solver that does not run in it.
+    """
 
     def residual(step: Array, _: None) -> Array:
         moved = start.moved(step[:, None])
         return whitened_residuals(moved, observation, images, medium)[:, 0]
 
     still = jnp.zeros(start.unknowns, images.mask.dtype)
-    found = optx.least_squares(
-        residual, solver, still, max_steps=options.max_iterations, throw=False
-    )
+    try:
+        found = optx.least_squares(
+            residual, solver, still, max_steps=options.max_iterations, throw=False
+        )
+    except (TypeError, ValueError) as error:
+        if still.dtype != jnp.float32:
+            raise
+        raise InputError(
+            f"optimistix's {type(solver).__name__} does not run in float32 while JAX has 64 bits: "
+            "use precision float64, or jaxcal.backend.LevenbergMarquardt()"
+        ) from error
     iterate = start.moved(found.value[:, None])
     return Fit.of(found, iterate, start, observation, images, medium, options.trace)
 
@@ -112,7 +125,7 @@ def self_tuned_with(
     options: Options,
 ) -> Fit:
     """Weighted solves of one problem, with Helmert's updates between them until the SDs stay."""
-    enough = images.used >= MINIMUM_SELF_TUNING
+    enough, tolerance = images.used >= MINIMUM_SELF_TUNING, sigma_tolerance(images.mask.dtype)
     squares = component_sums(start, observation, images, None, medium).squares
     crude = with_floor(jnp.sqrt(squares / observation.count(images)))
     first = jnp.where(enough, crude, observation.sigma)
@@ -127,12 +140,12 @@ def self_tuned_with(
 
     def unfinished(state: tuple) -> Array:
         _, _, rounds, change, _ = state
-        return jnp.any(change > TOLERANCE) & (rounds < MOST_UPDATES)
+        return jnp.any(change > tolerance) & (rounds < MOST_UPDATES)
 
     def one_round(state: tuple) -> tuple:
         fit, sigma, rounds, change, taken = state
         after = solve(fit.iterate, sigma)
-        moving = change > TOLERANCE
+        moving = change > tolerance
         moved = jnp.max(jnp.abs(jnp.log(after.updated / sigma)), axis=0)
         # A problem that is lost (NaN) must stop, not hold up the others.
         moved = jnp.where(jnp.isfinite(moved), moved, 0.0)
@@ -146,6 +159,8 @@ def self_tuned_with(
     empty = eqx.tree_at(lambda fit: fit.iterate, empty, start)
     one = jnp.ones_like(first[0])
     state = (empty, first, jnp.zeros((), jnp.int32), one, jnp.zeros(one.shape, jnp.int32))
-    fit, _, _, change, taken = jax.lax.while_loop(unfinished, one_round, state)
-    done = fit.converged & (change <= TOLERANCE)
-    return eqx.tree_at(lambda f: (f.converged, f.iterations), fit, (done, taken))
+    fit, _, rounds, change, taken = jax.lax.while_loop(unfinished, one_round, state)
+    done = fit.converged & (change <= tolerance)
+    return eqx.tree_at(
+        lambda f: (f.converged, f.iterations, f.rounds), fit, (done, taken, rounds[None])
+    )

@@ -74,8 +74,8 @@ def solve_batch(problems: Problem, estimate: tuple[str, ...], *, few: int = FEW)
     Returns:
         Arrays with the problems' leading axes. Concrete problems give numpy arrays in float64. Few
         of them, and those that this module does not certify, are solved one by one, by
-        :func:`jaxcal.solvers.closed_form.single.solve_problem`. A problem with NaN or fewer than 4
-        images gives NaN.
+        :func:`jaxcal.solvers.closed_form.single.solve_problem`. One with NaN or fewer than 4 images
+        gives NaN; traced, such a problem is not certified, and its numbers mean nothing.
 
     Raises:
         InputError: unknown names, a scale where there is none, or a transformation that began
@@ -100,11 +100,12 @@ def solve_batch(problems: Problem, estimate: tuple[str, ...], *, few: int = FEW)
 def _concrete(problems: Problem, estimate: tuple[str, ...], few: int) -> ClosedForm:
     count = len(problems.mask)
     answer = _unsolved(problems) if count <= few else _by_chunks(problems, estimate)
+    nothing = map_arrays(lambda leaf: leaf[0], _unsolved(problems)) if count else answer
     for k in np.flatnonzero(~answer.certified):
         try:
             alone = solve_problem(map_arrays(lambda leaf, k=k: leaf[k], problems), estimate)
         except InputError:
-            continue
+            alone = nothing
         for field in fields(ClosedForm):
             if getattr(answer, field.name) is not None:
                 getattr(answer, field.name)[k] = getattr(alone, field.name)
@@ -148,8 +149,8 @@ def _by_chunks(problems: Problem, estimate: tuple[str, ...]) -> ClosedForm:
 def solve_traceable(problems: Problem, estimate: tuple[str, ...]) -> ClosedForm:
     """Solve problems with one leading axis by array operations alone.
 
-    Traceable and differentiable. Where the dual is not tight ``certified`` is False, and the
-    answer is NaN.
+    Traceable and differentiable. Where the dual is not tight ``certified`` is False, and nothing
+    shows that the answer is the minimum.
     """
     constraints = CONSTRAINTS[estimate]
     mask = (problems.mask > 0).astype(problems.poses.dtype)
@@ -238,7 +239,10 @@ def _off(constraints: QuadraticConstraints, x: Vector) -> Vector:
 def _optimum(
     estimate: tuple[str, ...], matrix: Float[Array, "6 6 batch"], vector: Float[Array, "6 batch"]
 ) -> tuple[Float[Array, "6 batch"], Float[Array, "k batch"]]:
-    """The x and the multipliers at the dual's maximum, by Newton's method; NaN where that fails."""
+    """The x and the multipliers at the dual's maximum, by Newton's method.
+
+    Where that does not converge, they are those of its best step; without any, x is NaN.
+    """
     constraints = CONSTRAINTS[estimate]
     first = jnp.stack(unrolled.solve(_rows(matrix), list(vector)))
     start = _multipliers(constraints, matrix, vector, _feasible(first, constraints))

@@ -119,7 +119,6 @@ class Start:
         translation: of X, mm.
         point: the target in the tracker's frame, mm.
         scale: factors on the problem's [lateral, axial] spacing.
-        sound_speed: factor on the nominal one.
         searched: the minimum is not proved to be the only one; descents from many rotations found
             it.
     """
@@ -128,7 +127,6 @@ class Start:
     translation: Float[HeldArray, "*batch 3"]
     point: Float[HeldArray, "*batch 3"]
     scale: Float[HeldArray, "*batch 2"]
-    sound_speed: Float[HeldArray, "*batch"]
     searched: Bool[HeldArray, "*batch"]
 
 
@@ -141,7 +139,10 @@ def solve_problem(problem: Problem, estimate: tuple[str, ...] = ()) -> ClosedFor
 
 
 def in_closed_form(blocks: Blocks) -> tuple[str, ...]:
-    """Which of the unknowns :func:`solve_problem` estimates beside X and the target."""
+    """Which of the free unknowns a start estimates beside X and the target.
+
+    Sound speed and delay begin at their nominal values: the closed form knows no prior.
+    """
     return tuple(name for name in blocks if name == "scale")
 
 
@@ -165,7 +166,6 @@ def closed_form_start(problem: Problem, blocks: Blocks) -> Start:
         "translation": found.image_to_probe[:3, 3],
         "point": found.point_mm,
         "scale": scale,
-        "sound_speed": np.asarray(found.sound_speed_factor),
     }
     dtype = np.asarray(problem.mask).dtype
     parts = {name: np.asarray(value, dtype) for name, value in parts.items()}
