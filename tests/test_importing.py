@@ -167,7 +167,13 @@ def test_invalid_rows_are_counted(tmp_path):
         import_files([tmp_path / "t.csv"])
     recording, notes, *_ = import_files([tmp_path / "t.csv"], ImportOptions(skip_invalid=True))
     assert len(recording) == 6
-    assert notes == [f"{tmp_path / 't.csv'}: 4 invalid rows left out"]
+    left_out = "4 invalid rows left out (6, 7, 8, 9, counted from 0)"
+    assert notes == [f"{tmp_path / 't.csv'}: {left_out}"]
+    assert recording.calibration.frame is None
+    # Images are told by their rows where rows are missing among them.
+    (tmp_path / "t.csv").write_text("\n".join([lines[0], more[0], *lines[1:]]))
+    recording, *_ = import_files([tmp_path / "t.csv"], ImportOptions(skip_invalid=True))
+    np.testing.assert_array_equal(recording.calibration.frame, np.arange(1, 7))
 
 
 def test_a_pose_of_zeros_is_that_of_a_tool_not_seen(tmp_path):

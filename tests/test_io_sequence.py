@@ -77,6 +77,15 @@ def test_round_trip(tmp_path, name, compressed, kind):
     np.testing.assert_array_equal(np.array(list(found.images([1, 4]))), grey[[1, 4]])
 
 
+def test_a_nrrd_may_name_its_orientation_as_a_metaimage_does(tmp_path):
+    *_, images = written(tmp_path / "s.igs.nrrd")
+    content = (tmp_path / "s.igs.nrrd").read_bytes()
+    content = content.replace(b"ultrasound image orientation:", b"UltrasoundImageOrientation:")
+    (tmp_path / "s.igs.nrrd").write_bytes(content)
+    found = np.array(list(read_sequence(tmp_path / "s.igs.nrrd").images()))
+    np.testing.assert_array_equal(found, images)
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_other_readers(tmp_path, name):
     transforms, _, _, images = written(tmp_path / name)

@@ -155,8 +155,8 @@ def _nrrd_pixels(
             channels,
             _DTYPES[kind].newbyteorder(order),
             *orientation_and_kind(
-                fields.get("ultrasound image orientation", ""),
-                fields.get("ultrasound image type", ""),
+                _either(fields, "ultrasound image orientation"),
+                _either(fields, "ultrasound image type"),
             ),
             # As Slicer documents its volume sequences; it may also list frames along the last axis.
             interleaved=fields.get("kinds", "").startswith("list"),
@@ -164,6 +164,12 @@ def _nrrd_pixels(
         ),
         count,
     )
+
+
+def _either(fields: dict[str, str], name: str) -> str:
+    """A field as PLUS names it in NRRD, or else in MetaImage; nothing where it is missing."""
+    as_one_word = "".join(word.capitalize() for word in name.split())
+    return fields.get(name, fields.get(as_one_word, ""))
 
 
 def _axes(fields: dict[str, str]) -> list[str]:

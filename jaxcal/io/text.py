@@ -29,6 +29,9 @@ from jaxcal.runtime.messages import counted, quoted
 
 _LATEST_S = 1e11
 """Latest time, s after any beginning: three thousand years. Stamps in ms or ns are beyond it."""
+_MOST_NAMED = 20
+"""Largest number of rows that are named."""
+
 _MISSING = frozenset(("", "nan", "inf", "infinity", "na", "n/a", "null", "none"))
 _TRUE = frozenset(("1", "1.0", "true", "yes", "ok", "valid", "good", "tracked"))
 _FALSE = frozenset(
@@ -59,6 +62,7 @@ class PoseTable:
     Attributes:
         name: of the file.
         lines: (n,) where each row stands.
+        rows: (n,) which row of the table each is, counted from 0 without header and comments.
         poses: (n, 4, 4), mm, rotations projected to SO(3).
         points: (n, 2): [u, v] px, or [lateral, range] mm.
         kind: of the points.
@@ -67,13 +71,14 @@ class PoseTable:
         velocity: (n, 6) mm/s and rad/s, of the probe at these times, if poses were looked up.
         frame: (n,) number of the image.
         file: n names of images' files.
-        skipped: rows that were left out as invalid.
+        skipped: the rows of the table that were left out as invalid.
         length_stated: whether the header states the unit of translations.
         time_stated: whether times are dates, or the header states their unit.
     """
 
     name: str
     lines: list[int]
+    rows: list[int]
     poses: Float[np.ndarray, "n 4 4"] | None = None
     points: Float[np.ndarray, "n 2"] | None = None
     kind: Literal["pixel", "point"] = "pixel"
@@ -82,7 +87,7 @@ class PoseTable:
     velocity: Float[np.ndarray, "n 6"] | None = None
     frame: Int[np.ndarray, " n"] | None = None
     file: tuple[str, ...] | None = None
-    skipped: int = 0
+    skipped: tuple[int, ...] = ()
     length_stated: bool = False
     time_stated: bool = False
 
@@ -92,8 +97,12 @@ class PoseTable:
     @property
     def notes(self) -> list[str]:
         """What was left out, in words."""
-        rows = counted(self.skipped, "invalid row")
-        return [f"{self.name}: {rows} left out"] if self.skipped else []
+        if not self.skipped:
+            return []
+        rows = counted(len(self.skipped), "invalid row")
+        numbers = ", ".join(map(str, self.skipped[:_MOST_NAMED]))
+        more = ", ..." if len(self.skipped) > _MOST_NAMED else ""
+        return [f"{self.name}: {rows} left out ({numbers}{more}, counted from 0)"]
 
 
 def read_pose_table(
@@ -149,6 +158,7 @@ def read_pose_table(
         return PoseTable(
             name=table.name,
             lines=[table.lines[row] for row in rows],
+            rows=rows,
             poses=inverse_poses(poses) if invert_poses and poses is not None else poses,
             points=points,
             kind="pixel" if unit == "px" else "point",
@@ -175,6 +185,10 @@ def recording_of(
     if table.poses is None or table.points is None:
         missing = "poses" if table.poses is None else "points (u and v, or lateral and range)"
         raise InputError(f"{table.name}: holds no {missing}: name the file that has them as well")
+    frame = table.frame
+    if frame is None and table.rows != list(range(len(table))):
+        # A person looks for an image by its row.
+        frame = np.array(table.rows)
     images = make_images(
         table.poses,
         table.points,
@@ -182,7 +196,7 @@ def recording_of(
         time=table.time,
         velocity=table.velocity,
         spacing_mm=spacing_mm,
-        frame=table.frame,
+        frame=frame,
         minimum=minimum,
         where=table.name,
     )
@@ -343,8 +357,10 @@ def _columns(table: Table, quaternion: QuaternionOrder | None) -> Columns:
     return Columns(translation=(1, 2, 3), quaternion=order, time=0, point=(8, 9))
 
 
-def _used_rows(table: Table, columns: Columns, skip_invalid: bool) -> tuple[list[int], int]:
-    """Rows to use, and how many are left out as invalid."""
+def _used_rows(
+    table: Table, columns: Columns, skip_invalid: bool
+) -> tuple[list[int], tuple[int, ...]]:
+    """Rows to use, and those that are left out as invalid."""
     needed = [
         *(columns.matrix or ()),
         *(columns.translation or ()),
@@ -369,7 +385,7 @@ def _used_rows(table: Table, columns: Columns, skip_invalid: bool) -> tuple[list
             raise FormatError(f"{table.row(row)}: {why}: leave such rows out with --skip-invalid")
     if not kept:
         raise FormatError(f"all {len(table.rows)} rows are marked as invalid")
-    return kept, len(table.rows) - len(kept)
+    return kept, tuple(sorted(set(range(len(table.rows))) - set(kept)))
 
 
 def _first_missing(cells: list[str], columns: list[int]) -> int | None:

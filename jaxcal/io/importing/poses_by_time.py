@@ -148,6 +148,25 @@ def times_of_table(table: PoseTable, sequence: TrackedSequence) -> Float[np.ndar
     return table.time + (table.clock - sequence.clock).total_seconds()
 
 
+def _without_pose(
+    asked: Float[np.ndarray, " n"], between: Bool[np.ndarray, " n"], track: PoseTrack
+) -> str:
+    """How many images have no pose, and for what reasons."""
+    lost = asked[~between]
+    outside = int(((lost < track.time[0]) | (lost > track.time[-1])).sum())
+    # With every pose as if it could be used, those beside one that cannot be are not lost.
+    near = can_interpolate(track.time, lost, max_gap_s=track.gap_s)
+    beside = int(near.sum())
+    gaps = len(lost) - outside - beside
+    reasons = {
+        "outside the time of the poses": outside,
+        "beside a pose whose tracking was not OK": beside,
+        f"between poses more than {track.gap_s:.3g} s apart": gaps,
+    }
+    said = ", ".join(f"{count} {reason}" for reason, count in reasons.items() if count)
+    return f"{len(lost)} of {len(asked)} images have no pose at their time: {said}"
+
+
 def with_poses_by_time(
     images: TrackedSequence, tracking: TrackedSequence, lag_s: float = 0.0
 ) -> tuple[TrackedSequence, list[str]]:
@@ -178,7 +197,8 @@ def with_poses_by_time(
         raise InputError(
             f"{images.source}: no image lies between poses of {track.source}: images are from "
             f"{seconds(asked.min())} to {seconds(asked.max())}, poses from {seconds(time[0])} to "
-            f"{seconds(time[-1])}: do they use the same clock?"
+            f"{seconds(time[-1])}: do they use the same clock, and "
+            "seconds (milliseconds are read from a column 'time (ms)')?"
         )
     found = np.full((len(images), 4, 4), np.nan)
     found[between] = interpolate_poses(time, poses, asked[between], max_gap_s=gap, valid=valid)
@@ -191,12 +211,8 @@ def with_poses_by_time(
             f"interpolated poses are wrong by about {cost:.1f} mm (RMS, from leaving poses out); "
             "record poses more often, or hold the probe still for each image"
         )
-    lost = int((~between).sum())
-    if lost:
-        notes.append(
-            f"{lost} of {len(images)} images have no pose near their time (gaps of up to "
-            f"{gap:.3g} s are bridged)"
-        )
+    if not between.all():
+        notes.append(_without_pose(asked, between, track))
     return replace(
         images,
         transforms=dict.fromkeys(tracking.transforms, found),

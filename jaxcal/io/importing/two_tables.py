@@ -64,6 +64,7 @@ def one_of_two_tables(
         points,
         name=f"{poses.name} with {points.name}",
         lines=[points.lines[row] for row in kept],
+        rows=[points.rows[row] for row in kept],
         poses=found[kept],
         velocity=None if velocity is None else velocity[kept],
         length_stated=poses.length_stated,
