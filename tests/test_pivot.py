@@ -261,6 +261,9 @@ def test_poses_of_a_tool_are_read_from_sequences_and_tables(tmp_path):
     assert notes[1] == "1 of 5 frames left out: their tracking was not OK"
     probe, _ = tool_poses(file, ImportOptions(source="Probe"))
     np.testing.assert_allclose(probe, poses[::-1], atol=1e-9)
+    write_sequence(tmp_path / "probe.igs.mha", {other: poses}, np.arange(5.0))
+    _, notes = tool_poses(tmp_path / "probe.igs.mha", ImportOptions())
+    assert "no Stylus was tracked, so another tool was taken" in notes[-1]
 
     scalar_first = Rotation.from_matrix(poses[:, :3, :3]).as_quat()[:, [3, 0, 1, 2]]
     rows = np.concatenate([poses[:, :3, 3] / 1000, scalar_first], axis=1)
@@ -269,7 +272,7 @@ def test_poses_of_a_tool_are_read_from_sequences_and_tables(tmp_path):
     table.write_text("\n".join(["x [m],y [m],z [m],qw,qx,qy,qz", *lines[:3], ",,,,,,", lines[4]]))
     read, notes = tool_poses(table, ImportOptions(skip_invalid=True))
     np.testing.assert_allclose(read, poses[[0, 1, 2, 4]], atol=1e-9)
-    assert notes == [f"{table}: 1 invalid row left out"]
+    assert notes == [f"{table}: 1 invalid row left out (3, counted from 0)"]
     table.write_text("\n".join(lines))
     read, _ = tool_poses(table, ImportOptions(quaternion="wxyz", pose_units="m"))
     np.testing.assert_allclose(read, poses, atol=1e-9)

@@ -21,7 +21,9 @@ from jaxcal.cli.sequence_options import TABLES, with_options
 
 @click.command()
 @click.argument("poses", type=click.Path(), metavar="POSES")
-@click.option("--from", "source", metavar="FRAME", help="Tracked tool; Stylus by default.")
+@click.option(
+    "--from", "source", metavar="FRAME", help="Tracked tool; Stylus by default if it was tracked."
+)
 @click.option(
     "--to",
     "target",
@@ -37,7 +39,7 @@ def pivot(poses: str, no_robust: bool, as_json: bool, **options: Any) -> int:
     """Find the tip of a tracked tool that was turned about its tip.
 
     POSES is a sequence of PLUS or Slicer, an export of NDI ToolBox or Motive, a table (CSV) with a
-    header, or a text file with a row for each pose, tool -> tracker, mm: x y z qx qy qz qs, or the
+    header, or a text file with a row for each pose, tool -> tracker, mm: x y z qx qy qz qw, or the
     matrix row by row (12 or 16 numbers). Poses that do not fit the rest are left out and named;
     they are counted from 0, without those that were not tracked.
     """

@@ -295,7 +295,7 @@ def read_poses(
     """
     tabs = first_line(path)[0] == "\t"  # perhaps beside blanks, and at the ends of lines
     table = read_table(path, header=False, separator="" if tabs else None)
-    rows = _fixed(table, (7, 12, 16), "x y z qx qy qz qs, or a matrix row by row", finite=False)
+    rows = _fixed(table, (7, 12, 16), "x y z qx qy qz qw, or a matrix row by row", finite=False)
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     if rows.shape[1] != 7:
         matrices = rows.reshape(len(rows), -1, 4)

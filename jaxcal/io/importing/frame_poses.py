@@ -138,9 +138,12 @@ def tool_poses(
     if kind in ("sequence", "tracker", "scan"):
         refuse(options, ("quaternion", "skip_invalid"), "is for tables, but no table is read")
         sequence = read_tracked(source, options.pose_units)
-        if options.source is None and "Stylus" in sequence.frames():
-            options = replace(options, source="Stylus")
-        poses, valid, _, notes = tracked_poses(sequence, options)
+        tracked = "Stylus" in sequence.frames()
+        named = options.source is not None
+        chosen = options if named or not tracked else replace(options, source="Stylus")
+        poses, valid, _, notes = tracked_poses(sequence, chosen)
+        if not (named or tracked):
+            notes.append(f"{sequence.source}: no Stylus was tracked, so another tool was taken")
         return poses[valid], notes
     if kind != "table":
         raise InputError(f"{os.fspath(source)}: holds no poses of a tool")
