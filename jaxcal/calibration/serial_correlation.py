@@ -133,7 +133,7 @@ def _covariances(
     for k, factor in enumerate(_factors(waves, spectra, prior)):
         along = waves[:, k, :-1]
         middle = middle + whitened.variances[k] * (along.T * (factor @ spectra)) @ along
-    lower = np.linalg.cholesky(before)
+    lower = _lower(before)
     inner = np.linalg.solve(lower, inverse @ middle @ inverse)
     values, vectors = np.linalg.eigh(np.linalg.solve(lower, inner.T))
     turned = lower @ vectors
@@ -233,6 +233,14 @@ def _restricted_cost(joint: Float[np.ndarray, "g q q"]) -> Float[np.ndarray, " g
     return np.linalg.slogdet(information)[1] + squares
 
 
+def _lower(covariance: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
+    """The Cholesky factor of a covariance that may be singular to rounding."""
+    size = np.sqrt(np.diagonal(covariance))
+    values, vectors = np.linalg.eigh(covariance / np.outer(size, size))
+    least = 4 * len(size) * np.finfo(float).eps
+    return size[:, None] * np.linalg.cholesky((vectors * np.maximum(values, least)) @ vectors.T)
+
+
 def _stretched(
     covariance: Float[np.ndarray, "p p"],
     before: Float[np.ndarray, "p p"],
@@ -243,9 +251,9 @@ def _stretched(
     What it has beyond ``before`` does not come from the errors of single images (the doubt about
     the mean of the offsets, say), and stays as it is.
     """
-    lower = np.linalg.cholesky(before)
+    lower = _lower(before)
     values, vectors = np.linalg.eigh(np.linalg.solve(lower, np.linalg.solve(lower, covariance).T))
-    own = np.linalg.cholesky(after) @ vectors
+    own = _lower(after) @ vectors
     beyond = lower @ vectors
     found = (own * np.minimum(values, 1.0)) @ own.T
     return found + (beyond * np.maximum(values - 1.0, 0.0)) @ beyond.T
