@@ -185,7 +185,8 @@ class Recorder:
             "clock",
             t_host=t_host,
             device=device.encode()[:32],
-            offset=fit.offset_s,
+            # Host times in the file are shifted, so the fit must lead to those.
+            offset=fit.offset_s + self._time_offset,
             drift=fit.drift,
             reference=fit.reference_s,
             residual=float(np.median(fit.delay_s)),

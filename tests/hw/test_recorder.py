@@ -130,6 +130,17 @@ def test_counts_of_the_runs_of_a_recording_add_up(tmp_path):
         }  # fmt: skip
 
 
+def test_the_clocks_of_a_resumed_recording_lead_to_its_shifted_times(tmp_path):
+    path = tmp_path / "r.h5"
+    Recorder(path, HEADER).close()
+    with Recorder(path, time_offset_s=100.0) as recorder:
+        recorder.add_poses(poses(0, 1))
+        recorder.add_clock("robot", ClockFit(-5.0, 0.0, 5.0, np.array([1e-4])), 1.0)
+    with h5py.File(path) as file:
+        t_host = file["tracker/t_device"][0] + file["clock/offset"][0]
+        assert t_host == pytest.approx(file["tracker/t_host"][0])
+
+
 def test_signals_that_end_all_processes_leave_the_writer_to_the_acquisition(tmp_path):
     """At a system's shutdown: why the run has ended must still be written."""
     path = tmp_path / "rec.h5"
