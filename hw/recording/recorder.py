@@ -336,7 +336,8 @@ class Recorder:
             raise self.error
 
     def _note_drops(self) -> None:
-        for group, count in self.dropped.items():
+        # While a full queue is waited for, another thread may drop rows of a further group.
+        for group, count in dict(self.dropped).items():
             self.counts(group, {"dropped": count})
 
     def _stream(self, group: str, columns: Mapping[str, np.ndarray]) -> None:

@@ -13,6 +13,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
@@ -316,6 +317,23 @@ def test_what_finds_no_room_is_dropped_and_counted_but_no_image_is(tmp_path):
         assert len(file["us/frames"]) == 1000 - dropped
         assert file["us"].attrs["dropped"] == dropped
         assert len(file["calibration/pose"]) == 1
+
+
+def test_drops_are_counted_while_more_come(tmp_path):
+    """A group that was first dropped meanwhile ended the run with a RuntimeError."""
+    path = tmp_path / "rec.h5"
+    with Recorder(path, HEADER, queue_bytes=2**20) as recorder, ThreadPoolExecutor(1) as pool:
+        suspend(recorder._process.pid)
+        while not recorder.dropped:
+            recorder.add_images(frames(0, 100))
+        syncing = pool.submit(recorder.sync)
+        time.sleep(0.2)
+        while "ae" not in recorder.dropped:
+            recorder.add_echo(echo(0, 100))
+        os.kill(recorder._process.pid, signal.SIGCONT)
+        syncing.result()
+    with h5py.File(path) as file:
+        assert file["ae"].attrs["dropped"] == recorder.dropped["ae"]
 
 
 def test_a_disk_that_does_not_answer_or_is_full_is_one_line(tmp_path):
