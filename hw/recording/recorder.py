@@ -87,6 +87,8 @@ class Recorder:
         self.kept = self.path
         """Where the rows are: maybe another path, if the file was moved, removed or replaced."""
         self._ending = self._ended = self._closed = self._hung = False
+        self._unsent = False
+        """Whether something handed over did not reach the writer."""
         self._marks = 0
         # In a session of its own: Ctrl-C, or a signal to the whole group, must not stop the writer.
         self._process = spawn("hw.recording.writer_process", self.path, stdin=True, stderr=None)
@@ -440,6 +442,8 @@ class Recorder:
         if stuck or not ended:
             self._fail(OutputError(f"{self.path}: the writer did not end and was stopped"))
         self._listener.join(ending_s)
+        if self.error is None and (self._unsent or self._process.returncode):
+            self._fail(OutputError(f"{self.path}: the writer ended early; resume the recording"))
         # A writer that hangs in the disk outlives its kill, and the listener then waits for it.
         if self._process.stdout is not None and not self._listener.is_alive():
             self._process.stdout.close()
@@ -463,6 +467,7 @@ class Recorder:
         except OSError:
             # The writer is gone; the listener knows why.
             with self._lock:
+                self._unsent = True
                 self._queue.clear()
         finally:
             with suppress(OSError):

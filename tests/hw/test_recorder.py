@@ -168,6 +168,17 @@ def test_what_waits_is_written_though_closing_was_interrupted(tmp_path):
         assert file["events/text"][0] == b"interrupted"
 
 
+@pytest.mark.parametrize("waiting", [1, 400])
+def test_a_writer_that_dies_while_closing_is_told(tmp_path, waiting):
+    """What waits in the queue, or in the pipe, is lost, and nothing was said."""
+    recorder = Recorder(tmp_path / "rec.h5", HEADER)
+    suspend(recorder._process.pid)
+    recorder.add_images(frames(0, waiting))
+    threading.Timer(0.2, recorder._process.kill).start()
+    with pytest.raises(jaxcal.OutputError, match="ended early; resume"):
+        recorder.close()
+
+
 def test_a_finished_recording_is_what_calibrate_takes(tmp_path, capsys):
     path, recording = tmp_path / "rec.h5", simulated()
     with Recorder(path, HEADER) as recorder:
