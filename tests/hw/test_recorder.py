@@ -333,7 +333,8 @@ def test_what_finds_no_room_is_dropped_and_counted_but_no_image_is(tmp_path):
 def test_drops_are_counted_while_more_come(tmp_path):
     """A group that was first dropped meanwhile ended the run with a RuntimeError."""
     path = tmp_path / "rec.h5"
-    with Recorder(path, HEADER, queue_bytes=2**20) as recorder, ThreadPoolExecutor(1) as pool:
+    # No room for anything while something waits.
+    with Recorder(path, HEADER, queue_bytes=1) as recorder, ThreadPoolExecutor(1) as pool:
         suspend(recorder._process.pid)
         while not recorder.dropped:
             recorder.add_images(frames(0, 100))
