@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 
 from hw.acquisition.request import AcquisitionRequest, planned, request_in
-from hw.recording.check import Progress, check_resumable, read_progress
+from hw.recording.check import Progress, check_resumable, read_progress, resumed_offset_s
 from hw.recording.file import RecordingWriter
 from hw.recording.layout import RecordingHeader
 from hw.recording.recorder import Recorder
@@ -87,8 +87,8 @@ def prepare(setup: Setup, path: str | os.PathLike[str], request: AcquisitionRequ
 def open_recorder(path: str | os.PathLike[str], job: Job) -> Recorder:
     """A writer that makes the recording of a new job, or goes on with that of a resumed one."""
     if job.progress is not None:
-        gap = job.progress.last_s + 1.0 - job.setup.clock.now()
-        return Recorder(path, time_offset_s=max(gap, 0.0))
+        gap = resumed_offset_s(job.progress.last_s, job.setup.clock.now())
+        return Recorder(path, time_offset_s=gap)
     probe = job.setup.probe
     header = RecordingHeader(
         kind=job.request.kind,

@@ -16,7 +16,7 @@ import numpy as np
 from hw.freehand.guide import Guide, Taken
 from hw.freehand.posed import PosedImages
 from hw.freehand.request import FreeHand, Person, recorded_request
-from hw.freehand.run import KeptImages, Run, read_images
+from hw.freehand.run import KeptImages, Run, read_images, resumed_recorder
 from hw.recording.layout import RecordingHeader
 from hw.recording.recorder import Recorder
 from hw.runtime.errors import DeviceError
@@ -67,7 +67,7 @@ def acquire_free_hand(
         for line in _found(posed):
             person.say(line)
         if resume:
-            recorder = Recorder(path)
+            recorder = resumed_recorder(path)
         else:
             known = {**asked.settings(posed.pair), "image_spacing_mm": posed.spacing_mm}
             header = RecordingHeader("pixel", {}, 0, settings=json.dumps({_KIND: known}))
@@ -111,7 +111,13 @@ class _Run(Run):
         self._check_spacing(taken.posed.image.spacing_mm)
         self.kept.check_unit(taken.pose, self.recorder)
         self.recorder.add_images([taken.posed.image])
-        self.recorder.add_pixel(taken.pose, taken.pixel, taken.covariance, taken.time)
+        self.recorder.add_pixel(
+            taken.pose,
+            taken.pixel,
+            taken.covariance,
+            taken.time,
+            by_host=self.posed.by_arrival,
+        )
         self.kept.add(taken.pose)
         # The frame is on the disk; keeping all of them would fill the memory.
         self.guide.keep(replace(taken, posed=None, row=self.kept.rows[-1]))

@@ -27,7 +27,7 @@ from hw.active_echo.device import SILENT, ActiveEcho, EchoFrame
 from hw.freehand.guide import spread_of
 from hw.freehand.posed import PosedImage, PosedImages, pose_at_arrival
 from hw.freehand.request import FreeHand, Person, recorded_request
-from hw.freehand.run import KeptImages, Run, read_images
+from hw.freehand.run import KeptImages, Run, read_images, resumed_recorder
 from hw.midplane.amplitude_scan import fit_peak
 from hw.midplane.bracket import Bracket
 from hw.midplane.live_view import describe, profile
@@ -132,7 +132,7 @@ def acquire_by_injection(
         echo.stream(True)
         unit = described_electronics(echo)
         changes = compare_electronics(before, unit)
-        recorder = Recorder(path) if resume else _recorder(path, asked, setup, posed)
+        recorder = resumed_recorder(path) if resume else _recorder(path, asked, setup, posed)
         run = _Run(asked, person, posed, recorder, kept, setup, echo, unit, changes)
         return run.completed()
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from hw.freehand.posed import PosedImages
 from hw.freehand.request import FreeHand, FreeHandStopped, Person
-from hw.recording.check import opened, read_column
+from hw.recording.check import last_host_time, opened, read_column, resumed_offset_s
 from hw.recording.file import RecordingWriter
 from hw.recording.recorder import Recorder
 from hw.runtime.clock import REAL
@@ -142,6 +142,16 @@ class Run(ABC):
         """Say a line, and put it among the recording's events."""
         self.recorder.add_event(kind, text, REAL.now())
         self.person.say(f"{kind}: {text}")
+
+
+def resumed_recorder(path: str | os.PathLike[str]) -> Recorder:
+    """A writer that goes on with a recording: its host times go on after the last one.
+
+    Raises:
+        FormatError: not a recording that can be resumed.
+        OutputError: it cannot be opened for writing.
+    """
+    return Recorder(path, time_offset_s=resumed_offset_s(last_host_time(path), REAL.now()))
 
 
 def read_images(

@@ -40,6 +40,8 @@ from jaxcal.io.untrusted import (
     text,
 )
 
+_PAUSE_S = 1.0
+"""Between the last host time of a recording and the first one after it is resumed."""
 _MOST_MEMBERS = 100
 """Arrays in a group that is written once: ten times what an acquisition writes."""
 
@@ -127,10 +129,6 @@ def read_progress(path: str | os.PathLike[str]) -> Progress:
     """
     with opened(path) as root:
         taken = read_column(root, "calibration", "target", (IMAGES,), "i")
-        last = [0.0]
-        for name in ("tracker", "ae", "events"):
-            times = read_column(root, name, "t_host", (UpTo(2**27, "rows"),))
-            last.append(float(np.nanmax(times, initial=0.0)))
         targets = read_column(root, "plan", "targets", (IMAGES, 4, 4))
         # Checked but not changed in any digit: the plan's digest must be the same again.
         try:
@@ -147,11 +145,42 @@ def read_progress(path: str | os.PathLike[str]) -> Progress:
             max_elevation=read_column(root, "calibration", "max_elevation", (IMAGES,)),
             taken=taken,
             true_elevation=read_column(root, "placement", "true_elevation", (IMAGES,)),
-            last_s=max(last),
+            last_s=_last_host_time(root),
             probe=_probe(root),
             electronics=_electronics(root),
             ended=_lacks_images(root),
         )
+
+
+def resumed_offset_s(last_s: float, now_s: float) -> float:
+    """What is added to host times so that they go on a second after the last one of a file, s.
+
+    Args:
+        last_s: latest host time in the file.
+        now_s: by the clock of the run that goes on with it.
+    """
+    return max(last_s + _PAUSE_S - now_s, 0.0)
+
+
+def last_host_time(path: str | os.PathLike[str]) -> float:
+    """Latest host time in a recording, s; 0 where it has none. The file is not trusted.
+
+    Raises:
+        FormatError: not an acquisition's recording; one line that starts with the path.
+    """
+    with opened(path) as root:
+        return _last_host_time(root)
+
+
+def _last_host_time(root: Node) -> float:
+    last = [0.0]
+    for name in ("tracker", "us", "ae", "events"):
+        node = group(root, name)
+        # Free-hand recordings lack some groups, and /us has no columns before the first frame.
+        if node is not None and child(node, "t_host") is not None:
+            times = read_column(root, name, "t_host", (UpTo(2**27, "rows"),))
+            last.append(float(np.nanmax(times, initial=0.0)))
+    return max(last)
 
 
 def settings_of(path: str | os.PathLike[str]) -> dict[str, object]:

@@ -231,7 +231,7 @@ class Recorder:
             max_elevation=bracket.max_elevation_mm,
             amplitude=amplitude,
             mask=True,
-            time=t_host,
+            time=t_host + self._time_offset,
             target=target,
             **{kind: measurement},
         )
@@ -248,7 +248,13 @@ class Recorder:
         self.sync()
 
     def add_pixel(
-        self, pose: np.ndarray, pixel: np.ndarray, covariance: np.ndarray, time_s: float
+        self,
+        pose: np.ndarray,
+        pixel: np.ndarray,
+        covariance: np.ndarray,
+        time_s: float,
+        *,
+        by_host: bool = False,
     ) -> None:
         """Take an image of a free-hand acquisition: when this returns it is on the disk.
 
@@ -257,12 +263,18 @@ class Recorder:
             pixel: (2,) [u, v], px.
             covariance: (2, 2), px^2.
             time_s: of the image.
+            by_host: whether that is a host time, and not one of the sender's clock.
 
         Raises:
             OutputError: the writer failed, or did not answer in time.
         """
         self._row(
-            "calibration", pose=pose, pixel=pixel, covariance=covariance, mask=True, time=time_s
+            "calibration",
+            pose=pose,
+            pixel=pixel,
+            covariance=covariance,
+            mask=True,
+            time=time_s + (self._time_offset if by_host else 0.0),
         )
         self.sync()
 
@@ -354,9 +366,8 @@ class Recorder:
 
     def _rows(self, group: str, columns: Mapping[str, np.ndarray], *, wait: bool) -> bool:
         columns = dict(columns)
-        for name in ("t_host", "time"):
-            if name in columns:
-                columns[name] = columns[name] + self._time_offset
+        if "t_host" in columns:
+            columns["t_host"] = columns["t_host"] + self._time_offset
         return self._put("append", group, columns, wait=wait)
 
     def _put(self, do: str, *arguments: Any, wait: bool = True) -> bool:

@@ -43,6 +43,7 @@ from hw.recording.layout import RecordingHeader
 from hw.recording.recorder import Recorder
 from hw.robot.identity import read_identity
 from hw.robot.rtde import PacketReader
+from hw.runtime.clock import REAL
 from hw.runtime.errors import DeviceError
 from hw.runtime.interrupts import as_interrupts
 from hw.ultrasound.receiver import Image, UltrasoundStream
@@ -269,6 +270,9 @@ def test_a_lost_stream_is_gone_on_with(tmp_path, plus_server):
         jaxcal.load(path)
     with h5py.File(path) as file:
         before = len(file["calibration/pose"])
+    # As after a run on another day, whose clock counted from another moment.
+    with Recorder(path, time_offset_s=1000.0) as recorder:
+        recorder.add_event("later", "", REAL.now())
     port = plus_server(**asked, first=before)
     again = FreeHand("127.0.0.1", port)
     interrupting = Scripted(image_5="ctrl-c")
@@ -282,6 +286,11 @@ def test_a_lost_stream_is_gone_on_with(tmp_path, plus_server):
     assert len(images) == 7
     assert away.min(axis=1).max() < 0.1
     assert len(set(away.argmin(axis=1))) == 7
+    with h5py.File(path) as file:
+        assert (np.diff(file["events/t_host"]) >= 0).all()
+        assert file["us/t_host"][-1] > 1000.0
+        # These are the sender's.
+        assert np.abs(np.diff(file["calibration/time"])).max() < 500.0
 
 
 def test_too_few_images_stay_resumable(tmp_path, tracked):

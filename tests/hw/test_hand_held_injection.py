@@ -221,6 +221,9 @@ def test_a_person_follows_the_bar_by_hand(tmp_path, bench):
         electronics = replace(bench.setup, active_echo_url=other.path)
         with pytest.raises(RefusedError, match=r"100000000\.0 ticks .* 80000000\.0:"):
             acquire_by_injection(path, bench.asked, electronics, person, resume=True)
+    # As after a run on another day, whose clock counted from another moment.
+    with Recorder(path, time_offset_s=1000.0) as recorder:
+        recorder.add_event("later", "", REAL.now())
     bench.echo.identity = "another\0unit"
     assert acquire_by_injection(path, bench.asked, bench.setup, person, resume=True) == 4
     assert any(re.search(r'are "another.+unit" from here on', line) for line in person.lines)
@@ -237,6 +240,9 @@ def test_a_person_follows_the_bar_by_hand(tmp_path, bench):
         assert file["us/frames"].shape[0] == len(mask) == 5
         assert file.attrs["complete"]
         assert len(file["ae/tof_ticks"]) > 100
+        for times in ("events/t_host", "ae/t_host", "us/t_host", "calibration/time"):
+            assert (np.diff(file[times]) >= 0).all()
+            assert file[times][-1] > 1000.0
     assert mask.tolist() == [True, False, True, True, True]
     # What the drawing of the probe does not know (it is off by degrees) moves all of them alike.
     true = np.array([WORLD.truth(pose).elevation_mm for pose in poses])
