@@ -62,6 +62,8 @@ _FASTEST_MM_S = 6.0
 to some 50 ms, which at this speed is 0.3 mm, as much as the element's own accuracy."""
 _LATEST_S = Watch.echo_late_s
 """Frames of the element that are later are not used: the probe was elsewhere then."""
+_AGAIN_S = 1.0
+"""After so many seconds the delay of the element's frames is measured again where it is unknown."""
 _RECENT = 32
 _SHOW_PERIOD_S = 0.1
 _KEPT_S = 60.0
@@ -215,8 +217,12 @@ class _Run(Run):
         self._images.append(self.posed.read(_SILENCE_S))
         for _ in range(self.posed.behind - 1):
             self._images.append(self.posed.read(_SILENCE_S))
-        frames = self.echo.drain()
         now = time.monotonic()
+        unknown = not np.isfinite(self._late_s)
+        if now - self._delay_measured > (_AGAIN_S if unknown else DELAY_S):
+            self._delay_measured = now
+            self.echo.measure_delay()
+        frames = self.echo.drain()
         if frames:
             self._heard = now
         elif now - self._heard > _SILENCE_S:
@@ -224,10 +230,8 @@ class _Run(Run):
         self.recorder.add_echo(frames)
         if frames:
             self._late_s = frames[-1].late_s
-        if now - self._delay_measured > DELAY_S:
-            self._delay_measured = now
-            self.echo.measure_delay()
-        self._waiting += [frame for frame in frames if not frame.late_s > _LATEST_S]
+        # Not those whose delay is not known (NaN).
+        self._waiting += [frame for frame in frames if frame.late_s <= _LATEST_S]
         later = []
         for frame in self._waiting:
             pose = pose_at_arrival(self._images, frame.t_host)
@@ -310,7 +314,9 @@ class _Run(Run):
         view = self._view()
         late = ""
         late_s = self._images[-1].image.late_s
-        if self._late_s > _LATEST_S:
+        if not np.isfinite(self._late_s):
+            late = "the delay of the element's frames is not known: check the link to it"
+        elif self._late_s > _LATEST_S:
             late = f"the element's frames are {self._late_s:.1f} s late: check the link to it"
         elif late_s > _LATEST_S:
             late = f"the images are {late_s:.1f} s late: check the link to the server"

@@ -328,6 +328,32 @@ def test_frames_of_the_element_that_are_late_are_not_used_and_told_of(tmp_path):
     assert re.search(told, "\n".join(shown))
 
 
+def test_frames_of_the_element_whose_delay_is_not_known_are_not_used_and_told_of(tmp_path):
+    """It counts from another number than that of its frames: they may be from any time."""
+
+    class Ahead(AuspisEmulator):
+        def _answer(self, word: str, argument: str) -> str:
+            answer = super()._answer(word, argument)
+            return "1000000,1000000" if word == "TRIG:COUN?" else answer
+
+    class Waiting(Person):
+        def show(self, frame: np.ndarray, words: str, advice: str) -> None:
+            super().show(frame, words, "nothing heard: to and fro")
+            shown.append(words)
+            if len(shown) == 20:
+                self._keys.append("q")
+
+    shown: list[str] = []
+    bench = Bench()
+    bench.echo.__class__ = Ahead
+    with bench.echo, bench.images:
+        bench.hand.offset = bench.hand.aim = 0.0
+        with pytest.raises(FreeHandStopped, match="0 images are too few"):
+            acquire_by_injection(tmp_path / "r.h5", bench.asked, bench.setup, Waiting(bench.hand))
+    assert "mm |" not in "".join(shown)
+    assert "delay of the element's frames is not known: check the link" in shown[-1]
+
+
 def test_poses_that_a_slow_link_holds_up_are_not_those_of_the_frames_that_come_meanwhile():
     """The hand moves at 5 mm/s, and images and poses come half a second late: it was 2.5 mm on."""
     images = []
