@@ -129,9 +129,9 @@ class ProbeStage:
         """Load a pattern: a level (0 to 255) for each line."""
         self._session.echo.load_pattern(pattern)
 
-    def inject(self, on: bool, delay_ticks: int = 0) -> None:
+    def inject(self, on: bool, delay_s: float = 0.0) -> None:
         """Switch injection on or off."""
-        self._session.echo.inject(on, delay_ticks)
+        self._session.echo.inject(on, delay_s)
 
     def frame(self) -> np.ndarray | None:
         """The newest B-mode frame for the operator; None where no images come.

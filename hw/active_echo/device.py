@@ -202,20 +202,26 @@ class ActiveEcho:
             )
         self._ask("PATT:LOAD", pattern.hex(), expected=f"{zlib.crc32(pattern):08x}")
 
-    def inject(self, on: bool, delay_ticks: int = 0) -> None:
+    def inject(self, on: bool, delay_s: float = 0.0) -> None:
         """Answer each received pulse with the pattern, or only listen (as at power-up).
 
         Args:
             on: answer or not.
-            delay_ticks: between the received pulse and the answer, 0 to 65535.
+            delay_s: between the received pulse and the answer, at most 65535 ticks of the device's
+                clock.
+
+        Raises:
+            DeviceError: another delay, or not taken by the device.
         """
-        if not 0 <= delay_ticks <= _MAXIMUM_DELAY_TICKS:
-            raise DeviceError(
-                f"delay must be 0 to {_MAXIMUM_DELAY_TICKS} ticks, not {delay_ticks}",
-                device=DEVICE,
-            )
         if on:
-            self._ask("INJ:DEL", str(delay_ticks), expected=str(delay_ticks))
+            longest_s = _MAXIMUM_DELAY_TICKS * self._tick_s
+            if not 0 <= delay_s <= longest_s:
+                raise DeviceError(
+                    f"delay must be 0 to {longest_s:.4g} s with this clock, not {delay_s:g}",
+                    device=DEVICE,
+                )
+            ticks = str(round(delay_s / self._tick_s))
+            self._ask("INJ:DEL", ticks, expected=ticks)
         state = "ON" if on else "OFF"
         self._ask("PATT:STAT", state, expected=state)
 

@@ -100,7 +100,7 @@ class WorldStage:
         self.pattern = pattern
         self.seconds += self.pace.command_s
 
-    def inject(self, on: bool, delay_ticks: int = 0) -> None:
+    def inject(self, on: bool, delay_s: float = 0.0) -> None:
         """Off forgets the pattern."""
         self.pattern = self.pattern if on else None
         self.seconds += self.pace.command_s

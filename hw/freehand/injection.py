@@ -31,7 +31,7 @@ from hw.freehand.run import KeptImages, Run, read_images, resumed_recorder
 from hw.midplane.amplitude_scan import fit_peak
 from hw.midplane.bracket import Bracket
 from hw.midplane.live_view import describe, profile
-from hw.midplane.pattern_injection import View, bar, bar_length, sides_seen
+from hw.midplane.pattern_injection import BAR_DELAY_S, View, bar, bar_length, sides_seen
 from hw.midplane.search import Echoes, PlacementError
 from hw.recording.check import devices_of
 from hw.recording.layout import RecordingHeader
@@ -53,7 +53,6 @@ from jaxcal.runtime.array_types import Float
 
 _KIND = "pattern-injection"
 _SILENCE_S = 3.0
-_DELAY_TICKS = 400
 _PATTERN_PERIOD_S = 0.1
 _ANOTHER_DEG = 5.0
 """When the hand has turned the probe by more than this, a new sweep begins."""
@@ -289,7 +288,7 @@ class _Run(Run):
             return
         self._pattern, self._patterned = (length, self._loudest_line), now
         self.echo.load_pattern(bar(length, self._loudest_line, self.setup.probe.elements))
-        self.echo.inject(True, _DELAY_TICKS)
+        self.echo.inject(True, BAR_DELAY_S)
 
     @property
     def _loudest(self) -> float:

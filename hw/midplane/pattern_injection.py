@@ -34,8 +34,8 @@ _LEAST_SHORT = 2
 _SAME_PLACE_MM = 0.05
 _SWEEP_MM = 0.25
 """Step of the operator who follows the instructions by rule."""
-_DELAY_TICKS = 400
-"""How long after the echo the bar is sent, ticks of the device's clock."""
+BAR_DELAY_S = 4e-6
+"""How long after the echo the bar is sent: it appears 3 mm below the echo."""
 # The bar's scale begins at this part of the maximum, so that a few per cent near it can be seen.
 _SCALE_FROM = 0.4
 
@@ -48,7 +48,7 @@ class Injector(Protocol):
         """A level (0 to 255) for each line."""
         ...
 
-    def inject(self, on: bool, delay_ticks: int = 0) -> object:
+    def inject(self, on: bool, delay_s: float = 0.0) -> object:
         """Switch injection on or off; the delay puts the pattern below the echo."""
         ...
 
@@ -288,7 +288,7 @@ def _followed(
         view = View(seen, settings.fine_mm, frame, message, title)
         lines = echoes.amplitude.shape[1]
         injector.load_pattern(bar(view.length, echoes.loudest_line, lines))
-        injector.inject(True, _DELAY_TICKS)
+        injector.inject(True, BAR_DELAY_S)
         decision = operator(view)
         message = ""
         if decision.what == "give-up":

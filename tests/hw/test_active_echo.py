@@ -19,6 +19,7 @@ from hw.active_echo import ActiveEcho, EchoFrame, EchoStatistics
 from hw.active_echo.codec import EchoPacket, decode_line, encode_echo, encode_line, encode_reply
 from hw.active_echo.transport import open_transport
 from hw.bench.active_echo import AuspisEmulator
+from hw.midplane.pattern_injection import BAR_DELAY_S
 from hw.runtime.clock import Clock
 from hw.runtime.errors import DeviceError, LostError, RefusedError, StaleError
 
@@ -85,7 +86,7 @@ def test_commands(emulator: AuspisEmulator) -> None:
         assert not emulator.injection.on
         pattern = bytes(range(LINES))
         device.load_pattern(pattern)
-        device.inject(True, 40)
+        device.inject(True, 4e-7)
         assert (emulator.injection.on, emulator.injection.delay_ticks) == (True, 40)
         assert emulator.injection.pattern == pattern
         device.inject(False)
@@ -294,6 +295,16 @@ def test_left_streaming(emulator: AuspisEmulator) -> None:
         assert device.statistics().lost == 0
 
 
+def test_a_delay_is_the_same_time_with_any_clock() -> None:
+    """In ticks, the injected bar was at another depth where the clock is another one."""
+    with (
+        AuspisEmulator(echo, clock=Clock(speed=10.0), clock_hz=10e6) as emulator,
+        opened(emulator) as device,
+    ):
+        device.inject(True, BAR_DELAY_S)
+        assert emulator.injection.delay_ticks == 40
+
+
 def test_refusals(pty_emulator: AuspisEmulator) -> None:
     with opened(pty_emulator, lines=64) as device:
         with pytest.raises(RefusedError, match="refused PATT:LOAD: 4,value out of range"):
@@ -303,7 +314,7 @@ def test_refusals(pty_emulator: AuspisEmulator) -> None:
         for call in (
             lambda: device.set_threshold(4096),
             lambda: device.set_threshold(-1),
-            lambda: device.inject(True, 65536),
+            lambda: device.inject(True, 65536 * 1e-8),
             lambda: device.load_pattern(bytes(65)),
         ):
             with pytest.raises(DeviceError, match=r"active echo: (threshold|delay|a pattern)"):

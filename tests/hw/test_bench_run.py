@@ -17,7 +17,7 @@ pytest.importorskip("cobs", reason="cobs is not installed")
 from hw.active_echo.device import ActiveEcho
 from hw.bench.run import Bench, BenchOptions, start_bench
 from hw.bench.world import make_world
-from hw.midplane.pattern_injection import bar
+from hw.midplane.pattern_injection import BAR_DELAY_S, bar
 from hw.ultrasound.receiver import UltrasoundStream
 from jaxcal import InputError
 
@@ -70,9 +70,8 @@ def test_echo_of_the_true_pose_comes_through_the_port(bench):
 
 
 def test_images_show_the_injected_bar_below_the_echo(bench):
-    ticks = 400
     _, depth, _ = bench.truth(bench.true_pose())
-    below = depth + 0.5e3 * bench.probe.sound_speed_m_s * ticks / bench.addresses["clock_hz"]
+    below = depth + 0.5e3 * bench.probe.sound_speed_m_s * BAR_DELAY_S
     row = round(below / bench.spacing_mm[1])
     with (
         UltrasoundStream(*bench.ultrasound, clock=bench.clock) as stream,
@@ -87,7 +86,7 @@ def test_images_show_the_injected_bar_below_the_echo(bench):
 
         before = brightness(3)
         echo.load_pattern(bar(31, 64, 128))
-        echo.inject(True, ticks)
+        echo.inject(True, BAR_DELAY_S)
         deadline = time.monotonic() + 180
         while brightness(1) < 250 and time.monotonic() < deadline:
             pass

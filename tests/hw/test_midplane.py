@@ -249,10 +249,10 @@ class Unplugged(WorldStage):
         self.moves_after += self.reads > 8
         return super().move(offset_mm)
 
-    def inject(self, on, delay_ticks=0):
+    def inject(self, on, delay_s=0.0):
         if self.reads > 8:
             raise LostError("the port is still gone", device="active echo")
-        super().inject(on, delay_ticks)
+        super().inject(on, delay_s)
 
 
 @each
