@@ -41,6 +41,8 @@ _MOVED_MM = 0.3
 """An arm whose pose changes by more is not at rest; a degree counts as a mm."""
 DELAY_S = 10.0
 """After so many bench seconds the delay of the echo frames is measured again."""
+_RF_ALONE_S = 0.6
+"""RF that comes for so long without a B-mode frame is alone; less than ``Watch.image_age_s``."""
 _LEAST_STAMPS, _MOST_STAMPS, _MOST_FITTED = 20, 20_000, 2_000
 _MOST_DRIFT, _STEP_S = 1e-3, 0.1
 """Two quartz clocks differ by less than this drift; what a busy machine adds to it in all, s."""
@@ -114,6 +116,9 @@ class Session:
         self._moved_s = -math.inf
         self._shown: tuple[str, bool] | None = None
         """Device of the images, and whether they are RF channel data."""
+        self._recorded: tuple[str, bool] | None = None
+        """The same of the images in the recording."""
+        self._rf_since = math.inf
         self._failure: Exception | None = None
         self._bad: deque[tuple[float, str]] = deque(maxlen=_KEPT_FRAMES)
         self._stamps: dict[str, list[tuple[float, float]]] = {}
@@ -365,7 +370,7 @@ class Session:
         """Put the newest ultrasound frame into the recording, unless every frame goes there."""
         image = self.latest_image()
         if image is not None and not self._every_frame:
-            self._recorder.add_images([image])
+            self._record_images([image])
 
     def _pump(self) -> None:
         try:
@@ -422,19 +427,32 @@ class Session:
         self._waiting_poses += poses
         self._waiting_echo += frames
         if self._every_frame:
-            self._recorder.add_images(images)
+            self._record_images(images)
         if time.monotonic() - self._handed_over > _BATCH_WALL_S:
             self._hand_over()
 
     def _moved(self, pose: PoseSample) -> bool:
         return self._rest is None or apart(self._rest.pose, pose.pose) > _MOVED_MM
 
+    def _record_images(self, images: list[Image]) -> None:
+        """Record frames as the first one is: those of another device, or RF, may not fit to it."""
+        for image in images:
+            if self._recorded is None:
+                self._recorded = image.device, image.is_rf
+            if (image.device, image.is_rf) == self._recorded:
+                self._recorder.add_images([image])
+
     def _of_one_device(self, images: list[Image]) -> list[Image]:
         """Those that are shown and recorded: of the first device, RF only where nothing else is.
 
-        Frames of several devices do not fit into one recording.
+        Frames of several devices do not fit into one recording. Where RF comes first, it waits for
+        a moment whether B-mode frames follow.
         """
         for image in images:
+            if self._shown is None and image.is_rf:
+                self._rf_since = min(self._rf_since, image.t_host)
+                if image.t_host - self._rf_since < self.clock.patience(_RF_ALONE_S):
+                    continue
             if self._shown is None or (self._shown[1] and not image.is_rf):
                 self._shown = image.device, image.is_rf
         return [image for image in images if (image.device, image.is_rf) == self._shown]

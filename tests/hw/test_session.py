@@ -228,14 +228,22 @@ def test_clocks_that_are_wrong_and_images_that_are_lost_are_recorded(tmp_path):
     assert any(re.match(rb"ultrasound: its clock was set, or counts ", text) for text in told)
 
 
-def test_images_of_a_machine_that_also_sends_rf(tmp_path):
+class RfFirst(ImageServer):
+    """Of the first images only the RF channel data come."""
+
+    def _broadcast(self, batch: list[bytes]) -> None:
+        super()._broadcast(batch if self.sent > 8 else batch[1:])
+
+
+@pytest.mark.parametrize("server", [ImageServer, RfFirst])
+def test_images_of_a_machine_that_also_sends_rf(tmp_path, server):
     """RF channel data have another size: in one recording with the images they ended the run."""
     path = tmp_path / "r.h5"
     scene = Scene(np.eye(4), np.array([400.0, -100.0, 0.0]), np.array([0.0, 0.0, -1.0]))
     with (
         EmulatedRobot() as robot,
         AuspisEmulator(silence, clock=robot.clock, lines=8) as emulator,
-        ImageServer(
+        server(
             lambda t: np.full((40, 30), int(1000 * t) % 256, np.uint8),
             rf=lambda t: np.full((200, 8), int(1000 * t) % 1000, np.int16),
         ) as machine,
