@@ -398,14 +398,15 @@ class _Run:
             DeviceError: a device is in lasting trouble, or the pose changed at rest.
         """
         setup = self.job.setup
-        pose = stage.resting_pose(setup.settle_s)
+        pose, image = stage.resting_pose(setup.settle_s), None
         if self.job.request.by_image:
-            measurement, amplitude = stage.locate(row)
+            # The frame that is measured is the one that is recorded.
+            measurement, amplitude, image = stage.locate(row)
         else:
             heard = session.listen(setup.frames, stage.arrived_s)
             measurement, amplitude = median_times(heard)
         stage.check()
-        session.record_image()
+        session.record_image(image)
         return pose, measurement, amplitude
 
     def _select(

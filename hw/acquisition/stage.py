@@ -195,8 +195,8 @@ class ProbeStage:
         place = pixel_of(expected, image.spacing_mm, image.array.shape[1])
         return place, _NEAR_MM / max(image.spacing_mm)
 
-    def locate(self, row: int) -> tuple[Float[np.ndarray, " 2"], float]:
-        """[lateral, range] (mm) of the target in a frame where the probe stands, and its contrast.
+    def locate(self, row: int) -> tuple[Float[np.ndarray, " 2"], float, Image]:
+        """[lateral, range] (mm) of the target in a frame where the probe stands, contrast, frame.
 
         Size and pixels are those of the same frame: the machine's depth may be changed any time.
 
@@ -214,7 +214,7 @@ class ProbeStage:
                 self._check_new(image)
                 contrast = float(found.contrast_db[0])
                 columns = image.array.shape[1]
-                return place_of(found.position[0], image.spacing_mm, columns), contrast
+                return place_of(found.position[0], image.spacing_mm, columns), contrast, image
             reason = found.reason[0]
         raise PlacementError(
             f"no credible target in {_LOOKS} frames: {reason}", device="ultrasound"

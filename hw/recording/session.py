@@ -366,9 +366,13 @@ class Session:
             first = self._first_seen.get(zlib.crc32(image.array.tobytes()), image.t_host)
             return first <= self._moved_s
 
-    def record_image(self) -> None:
-        """Put the newest ultrasound frame into the recording, unless every frame goes there."""
-        image = self.latest_image()
+    def record_image(self, image: Image | None = None) -> None:
+        """Put an ultrasound frame into the recording, unless every frame goes there.
+
+        Args:
+            image: which one; None: the newest one, if there is any.
+        """
+        image = self.latest_image() if image is None else image
         if image is not None and not self._every_frame:
             self._record_images([image])
 

@@ -331,6 +331,7 @@ def test_a_depth_that_is_changed_between_two_frames_does_not_move_the_target():
     frame = camera.frame(pose, np.random.default_rng(0))
     images = [(frame, 1.0), (np.ascontiguousarray(frame[::2, ::2]), 2.0)]
     stage = ProbeStage(Seen(world, pose, images), Resting(), pose[None], lambda kind, text: None)
-    for _ in images:
-        place, _ = stage.locate(0)
+    for seen, _ in images:
+        place, _, image = stage.locate(0)
+        assert image.array is seen
         np.testing.assert_allclose(place, [3.0, 45.0], atol=0.3)
