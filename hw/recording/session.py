@@ -125,7 +125,7 @@ class Session:
         self._waiting_poses: list[PoseSample] = []
         self._waiting_echo: list[EchoFrame] = []
         self._handed_over = time.monotonic()
-        self._stopping = False
+        self._stopping = self._closed = False
         self._began = self.clock.now()
         self._echo_seen = self._image_seen = self._began
         with ExitStack() as opened:
@@ -163,14 +163,18 @@ class Session:
 
     def close(self) -> None:
         """Record what still waits and close every device; safe to repeat."""
-        if self._stopping:
+        if self._closed:
             return
         self._stopping = True
-        self._thread.join()
-        with suppress(CalibrationError):
-            self._record_clocks()
-            self._record_losses()
-        self._devices.close()
+        try:
+            self._thread.join()
+            with suppress(CalibrationError):
+                self._record_clocks()
+                self._record_losses()
+        finally:
+            # Also where Ctrl-C ends the wait for the thread.
+            self._devices.close()
+        self._closed = True
 
     # Trouble
 

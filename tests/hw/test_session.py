@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import signal
 import socket
 import subprocess
 import tempfile
@@ -291,6 +292,24 @@ def test_a_pose_that_changes_at_rest_is_no_pose_of_an_image(tmp_path):
             robot.ask("tcp_offset", (0.0, 0.0, 0.102, 0.0, 0.0, 0.0))
             with pytest.raises(RefusedError, match="set the TCP offset as before"):
                 stage.resting_pose(0.1)
+
+
+def test_devices_are_closed_though_closing_was_interrupted(tmp_path, monkeypatch):
+    scene = Scene(np.eye(4), np.array([400.0, -100.0, 0.0]), np.array([0.0, 0.0, -1.0]))
+    with (
+        EmulatedRobot() as robot,
+        AuspisEmulator(silence, clock=robot.clock, lines=8) as emulator,
+        Recorder(tmp_path / "r.h5", RecordingHeader("pixel", {}, 8, settings="{}")) as recorder,
+    ):
+        probe = LinearProbe(elements=8)
+        setup = Setup(robot.host, emulator.path, scene, {}, probe=probe, clock=robot.clock)
+        monkeypatch.setattr("hw.recording.session._PERIOD_WALL_S", 2.0)
+        session = Session(setup, recorder)
+        threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
+        with pytest.raises(KeyboardInterrupt):
+            session.close()
+        assert not session.echo._reader.is_alive()
+        session.close()
 
 
 @pytest.mark.real_time
