@@ -6,6 +6,7 @@ import itertools
 import json
 import os
 import socket
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -125,6 +126,28 @@ def test_a_setup_and_a_pose_arrive_as_they_were_sent():
     assert sample_of(json.loads(json.dumps(plain(sample)))) == sample
     error = RefusedError("not allowed", device="robot")
     assert str(error_of(told(error))) == str(error)
+
+
+ANOTHER_VERSION = """
+import sys
+from hw.robot.mover.program import guarded_program
+from hw.runtime.errors import LostError
+try:
+    guarded_program(object(), "127.0.0.1", 2.0)
+except LostError as error:
+    print(error)
+finally:
+    print("end", flush=True)
+"""
+
+
+def test_the_child_that_asks_for_the_program_ends_whatever_it_meets():
+    """It went on as a second caller of the robot, where ur_rtde is another than expected."""
+    run = [sys.executable, "-c", ANOTHER_VERSION]
+    told = subprocess.run(run, capture_output=True, text=True, check=False)
+    lines = told.stdout.splitlines()
+    assert lines[1:] == ["end"]
+    assert "no program to send to the controller: AttributeError: " in lines[0]
 
 
 def test_a_stop_that_is_read_with_the_setup_is_latched(pipe):

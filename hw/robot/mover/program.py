@@ -40,16 +40,21 @@ def guarded_program(module: Any, host: str, watchdog_hz: float) -> bytes:
     read, write = os.pipe()
     child = os.fork()
     if child == 0:
-        # A silent controller would hold it for ever, and the parent may be killed.
-        signal.setitimer(signal.ITIMER_REAL, _PATIENCE_S)
-        be_prompt(0)
         try:
-            text = _text_of(module, host)
-        except (RuntimeError, OSError) as error:
-            text = (said(error) if isinstance(error, RuntimeError) else str(error)).encode()
-        with open(write, "wb") as out:
-            out.write(text)
-        os._exit(0)
+            # A silent controller would hold it for ever, and the parent may be killed.
+            signal.setitimer(signal.ITIMER_REAL, _PATIENCE_S)
+            be_prompt(0)
+            try:
+                text = _text_of(module, host)
+            except (RuntimeError, OSError) as error:
+                text = (said(error) if isinstance(error, RuntimeError) else str(error)).encode()
+            except Exception as error:
+                text = f"{type(error).__name__}: {error}".encode()
+            with open(write, "wb") as out:
+                out.write(text)
+        finally:
+            # Whatever it meets, it must not go on as a second process that moves the robot.
+            os._exit(0)
     os.close(write)
     with open(read, "rb") as source:
         text = source.read()
