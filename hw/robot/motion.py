@@ -234,7 +234,7 @@ class Motion:
     def _stop_and_wait(self) -> None:
         """Stop after an interrupt or a failed guard, before its exception goes on."""
         try:
-            self.stop("interrupted")
+            self.stop(_failure(sys.exc_info()[1]))
             self._in_motion = False
         finally:
             self._wait_for_end()
@@ -425,3 +425,13 @@ class Motion:
                 pass
             case _:
                 self._answers.put(message)
+
+
+def _failure(error: BaseException | None) -> str:
+    """Why a motion is stopped whose caller is left by an exception; it must not fail itself."""
+    if error is None or isinstance(error, KeyboardInterrupt):
+        return "interrupted"
+    reason = f"the caller failed: {type(error).__name__}"
+    with contextlib.suppress(Exception):
+        reason += f": {error}"
+    return reason

@@ -66,12 +66,14 @@ def test_a_hesitation_at_full_speed_leaves_the_watchdog_at_rest():
 def test_a_guard_that_fails_stops_the_robot():
     def guard() -> str | None:
         if robot.state()["velocity"][0] > 0.04:
-            raise ZeroDivisionError
+            raise ZeroDivisionError("of the guard")
         return None
+
+    log: list = []
 
     with (
         EmulatedRobot(version=CB_SERIES) as robot,
-        moving(robot, guard=guard, caller_s=2.0) as motion,
+        moving(robot, log, guard=guard, caller_s=2.0) as motion,
     ):
         with pytest.raises(ZeroDivisionError):
             motion.move_to(PLAN.targets[2])
@@ -79,8 +81,10 @@ def test_a_guard_that_fails_stops_the_robot():
         assert state["rest_since"] is not None
         assert state["raw"][0] < START[0] + 0.049
         motion.guard = None
-        with pytest.raises(RefusedError, match="confirm the plan again"):
+        why = "the caller failed: ZeroDivisionError: of the guard"
+        with pytest.raises(RefusedError, match=rf"{why}\); confirm the plan again"):
             motion.move_to(HOME)
+    assert why in [numbers.get("why") for _, command, numbers in log if command == "stop"]
 
 
 @pytest.mark.parametrize("times", [1, 2])
