@@ -246,11 +246,14 @@ class PoseStream:
         waiting = Waiting(self.clock)
         with self._lock:
             self._listeners.append(come)
-            while not come or come[-1].t_host < start + seconds:
-                if self._error or waiting.so_far() > longest:
-                    break
-                self._condition.wait(_TURN_WALL_S)
-            self._listeners = [other for other in self._listeners if other is not come]
+            try:
+                while not come or come[-1].t_host < start + seconds:
+                    if self._error or waiting.so_far() > longest:
+                        break
+                    self._condition.wait(_TURN_WALL_S)
+            finally:
+                # Also after Ctrl-C: the list would grow for ever.
+                self._listeners = [other for other in self._listeners if other is not come]
             error = self._error
         self._check(error)
         seen = [sample for sample in come if sample.t_host >= start]

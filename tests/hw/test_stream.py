@@ -182,6 +182,14 @@ def test_nobody_there():
         PoseStream("127.250.250.1", timeout_s=0.5).start()
 
 
+def test_an_average_that_is_interrupted_keeps_no_poses():
+    with EmulatedRobot() as robot, PoseStream(robot.host, clock=robot.clock) as poses:
+        threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
+        with pytest.raises(KeyboardInterrupt):
+            poses.steady(1e3)
+        assert not poses._listeners
+
+
 @pytest.mark.real_time
 def test_averages_of_steady_poses():
     with EmulatedRobot() as robot, PoseStream(robot.host, clock=robot.clock) as poses:
