@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import math
+import os
 import queue
+import signal
 import socket
 import struct
 import threading
