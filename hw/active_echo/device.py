@@ -378,14 +378,19 @@ class ActiveEcho:
     # Reading
 
     def _read_on(self) -> None:
-        """The reader's thread: bytes to frames and replies, until closed or unplugged."""
+        """The reader's thread: an error that nobody expected ends the stream, too, not silently."""
+        try:
+            self._read_all()
+        except Exception as error:
+            self._fail(LostError(f"{type(error).__name__}: {error}", device=DEVICE))
+
+    def _read_all(self) -> None:
+        """Bytes to frames and replies, until closed or unplugged."""
         while not self._stopping:
             try:
                 data = self._transport.read()
             except LostError as error:
-                with self._lock:
-                    self._failure = error
-                    self._changed.notify_all()
+                self._fail(error)
                 return
             if not data:
                 continue
@@ -397,6 +402,11 @@ class ActiveEcho:
                     else:
                         self._take(item, now)
                 self._changed.notify_all()
+
+    def _fail(self, error: LostError) -> None:
+        with self._lock:
+            self._failure = error
+            self._changed.notify_all()
 
     def _take(self, packet: EchoPacket, now: float) -> None:
         if (packet.frame, packet.ticks) in self._recent:

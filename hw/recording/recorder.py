@@ -485,6 +485,16 @@ class Recorder:
                 pipe.close()
 
     def _listen(self, pipe: BinaryIO) -> None:
+        try:
+            self._hear(pipe)
+        except Exception as error:
+            # Here nobody would see it, and who waits for an answer would wait for long.
+            self._fail(OutputError(f"{self.path}: {type(error).__name__}: {error}"))
+            return
+        if not self._ending:
+            self._fail(OutputError(f"{self.path}: the writer ended; resume the recording"))
+
+    def _hear(self, pipe: BinaryIO) -> None:
         for line in pipe:
             answer = json.loads(line)
             if "kept" in answer:
@@ -499,8 +509,6 @@ class Recorder:
                 if "mark" in answer:
                     self._answers[answer["mark"]] = answer
                 self._changed.notify_all()
-        if not self._ending:
-            self._fail(OutputError(f"{self.path}: the writer ended; resume the recording"))
 
     def _fail(self, error: CalibrationError) -> None:
         with self._lock:

@@ -250,7 +250,19 @@ class UltrasoundStream:
             )
 
     def _receive(self) -> None:
-        """The receiver's thread: bytes to images, until closed or left by the server."""
+        """The receiver's thread: an error that nobody expected ends the stream, too, not silently."""
+        try:
+            self._receive_all()
+        except Exception as error:
+            self._fail(f"{type(error).__name__}: {error}")
+
+    def _fail(self, reason: str) -> None:
+        with self._lock:
+            self._failure = LostError(reason, device=DEVICE)
+            self._changed.notify_all()
+
+    def _receive_all(self) -> None:
+        """Bytes to images, until closed or left by the server."""
         connection = self._socket
         assert connection is not None
         chunk = memoryview(bytearray(_CHUNK))
@@ -262,11 +274,7 @@ class UltrasoundStream:
             except OSError:
                 count = 0
             if not count:
-                with self._lock:
-                    self._failure = LostError(
-                        f"{self.address} has closed the connection", device=DEVICE
-                    )
-                    self._changed.notify_all()
+                self._fail(f"{self.address} has closed the connection")
                 return
             now = self._clock.now()
             messages = self._decoder.feed(chunk[:count], now)

@@ -206,6 +206,9 @@ class LiveView(Audience):
                 self.seconds = time.thread_time() - before
         except OSError:
             self._say("view: the viewer ended; the acquisition goes on without it")
+        except Exception as error:
+            why = f"{type(error).__name__}: {error}"
+            self._say(f"view: {why}; the acquisition goes on without it")
 
     def _write(self) -> None:
         """Hand over what the viewer takes within half a period.

@@ -305,6 +305,15 @@ def test_a_delay_is_the_same_time_with_any_clock() -> None:
         assert emulator.injection.delay_ticks == 40
 
 
+def test_an_error_that_nobody_expected_ends_the_stream(pty_emulator, monkeypatch) -> None:
+    """It ended the reader's thread alone: every later frame was only late."""
+    with opened(pty_emulator) as device:
+        device.stream(True)
+        monkeypatch.setattr(device, "_recent", None)
+        with pytest.raises(LostError, match="TypeError"):
+            exhaust(device, PATIENCE_S)
+
+
 def test_refusals(pty_emulator: AuspisEmulator) -> None:
     with opened(pty_emulator, lines=64) as device:
         with pytest.raises(RefusedError, match="refused PATT:LOAD: 4,value out of range"):

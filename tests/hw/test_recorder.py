@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import hashlib
+import io
 import os
 import resource
 import signal
@@ -140,6 +141,16 @@ def test_the_clocks_of_a_resumed_recording_lead_to_its_shifted_times(tmp_path):
     with h5py.File(path) as file:
         t_host = file["tracker/t_device"][0] + file["clock/offset"][0]
         assert t_host == pytest.approx(file["tracker/t_host"][0])
+
+
+def test_an_answer_that_is_none_ends_the_recording(tmp_path):
+    """It ended the thread alone, and the next image waited for half a minute."""
+    recorder = Recorder(tmp_path / "r.h5", HEADER)
+    recorder._listen(io.BytesIO(b"printed by a library\n"))
+    with pytest.raises(jaxcal.OutputError, match="JSONDecodeError"):
+        recorder.sync()
+    with pytest.raises(jaxcal.OutputError, match="JSONDecodeError"):
+        recorder.close()
 
 
 def test_signals_that_end_all_processes_leave_the_writer_to_the_acquisition(tmp_path):

@@ -188,6 +188,14 @@ def test_dropped_connection(server: ImageServer) -> None:
         connected(server).start()
 
 
+def test_an_error_that_nobody_expected_ends_the_stream(server: ImageServer, monkeypatch) -> None:
+    """It ended the receiver's thread alone: the machine seemed to be frozen."""
+    with connected(server) as stream:
+        monkeypatch.setattr(stream, "_last", None)
+        with pytest.raises(LostError, match="AttributeError"):
+            exhaust(stream, PATIENCE_S)
+
+
 def test_corrupted_images_are_counted(server: ImageServer) -> None:
     """Every image handed on is one that was made; those missing are counted."""
     with connected(server, queue=1000) as stream:
