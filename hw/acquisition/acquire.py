@@ -289,7 +289,7 @@ class _Run:
         reach = NOT_CHECKED if course is None else f"{plan.limits.arm_model}: {course.text}"
         self._note("arm", reach)
         done = [row for row in range(len(job.targets)) if row not in job.missing]
-        self.view.plan(setup, plan, job.targets, done)
+        self.view.plan(setup, plan, job.targets, done, job.images)
         confirmation = confirm(plan)
         record_confirmed(job, plan, session, self.recorder)
         by = "unattended: nobody was asked" if confirmation.unattended else "by the operator"

@@ -41,9 +41,14 @@ class Audience:
     """Is told of the progress of an acquisition, and ignores it; see :class:`LiveView`."""
 
     def plan(
-        self, setup: Setup, plan: MotionPlan, targets: Float[np.ndarray, "n 4 4"], done: list[int]
+        self,
+        setup: Setup,
+        plan: MotionPlan,
+        targets: Float[np.ndarray, "n 4 4"],
+        done: list[int],
+        images: int | None = None,
     ) -> None:
-        """What shall be acquired: all poses, and the rows that a resumed recording has."""
+        """What shall be acquired: all poses, the rows that a resumed recording has, most images."""
 
     def watch(self, session: Session | None) -> None:
         """Show the poses and frames of this session; None: show them no longer."""
@@ -134,9 +139,14 @@ class LiveView(Audience):
     # What the acquisition tells
 
     def plan(
-        self, setup: Setup, plan: MotionPlan, targets: Float[np.ndarray, "n 4 4"], done: list[int]
+        self,
+        setup: Setup,
+        plan: MotionPlan,
+        targets: Float[np.ndarray, "n 4 4"],
+        done: list[int],
+        images: int | None = None,
     ) -> None:
-        """What shall be acquired: all poses, and the rows that a resumed recording has."""
+        """What shall be acquired: all poses, the rows that a resumed recording has, most images."""
         scene, limits = setup.scene, plan.limits
         self._tell(
             plan=np.asarray(targets, float)[:, :3].reshape(-1, 12).tolist(),
@@ -147,6 +157,7 @@ class LiveView(Audience):
             point=np.asarray(scene.point_mm, float).tolist(),
             width_mm=float(setup.probe.width_mm),
             done=list(done),
+            images=len(targets) if images is None else images,
             given_up=[],
             row=None,
         )

@@ -337,7 +337,7 @@ class Page:
 
 def state_words(told: dict[str, Any]) -> str:
     """How far the acquisition is, as markdown."""
-    total, done = len(told["plan"]), len(told["done"])
+    total, done = told["images"], len(told["done"])
     first = f"**{done} of {total} images**"
     if told.get("row") is not None and done < total:
         first += f", now pose {told['row'] + 1}"

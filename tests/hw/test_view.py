@@ -19,11 +19,13 @@ pytest.importorskip("viser", reason="viser is not installed (jaxcal[view])")
 import msgspec
 import viser
 from browser import addresses, browsing, pixels
+from motions import PLAN
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from hw.midplane.bracket import Bracket, Placement
 from hw.planning.poses import Extent, plan_poses
+from hw.planning.scene import Scene
 from hw.recording.layout import RecordingHeader
 from hw.recording.recorder import Recorder
 from hw.recording.session import Session
@@ -31,15 +33,20 @@ from hw.robot.confirmation import confirm_unattended
 from hw.robot.motion import Motion
 from hw.robot.motion_plan import MotionPlan
 from hw.robot.stream import PoseSample
+from hw.runtime.clock import Clock
 from hw.runtime.errors import LostError, StaleError
 from hw.runtime.extras import missing
 from hw.runtime.rigid import looking_rotation
 from hw.setup.description import Setup
 from hw.setup.emulated import setup_of, start
 from hw.view.feed import LiveView, halved, watched
-from hw.view.page import ellipsoid, to_scale
+from hw.view.page import ellipsoid, state_words, to_scale
+from jaxcal.data.probe import LinearProbe
 
 PLACEMENT = Placement(Bracket(0.1, -0.7, 0.9, 0.3), 0.1, 3, np.zeros((0, 3)))
+LIMITS = replace(PLAN.limits, arm_model="")
+SCENE = Scene(np.eye(4), np.array([400.0, -100.0, 0.0]), np.array([0.0, 0.0, -1.0]))
+SETUP = Setup("127.0.0.1", "", SCENE, {}, None, probe=LinearProbe(elements=128), clock=Clock())
 
 
 def wait_until(condition, timeout_s: float = 180.0, every_s: float = 0.02) -> None:
@@ -262,6 +269,15 @@ def test_the_extra_is_named_where_viser_is_missing():
     text = missing("viser_that_is_not_there", extra="view")
     assert text is not None
     assert 'pip install "jaxcal[view]"' in text
+
+
+def test_the_page_counts_images_and_not_the_poses_of_a_pool(shared_view):
+    poses = np.tile(np.eye(4), (180, 1, 1))
+    plan = MotionPlan(poses, LIMITS, (0.0,) * 6, "none")
+    shared_view.plan(SETUP, plan, poses, list(range(12)), 60)
+    assert state_words(shared_view._slow) == "**12 of 60 images**"
+    shared_view.plan(SETUP, plan, poses, [])
+    assert state_words(shared_view._slow) == "**0 of 180 images**"
 
 
 def test_geometry_of_the_page():
