@@ -49,8 +49,8 @@ _GREY, _ARM, _DONE, _NOW, _MISSED = (
 _TARGET = (200, 0, 120)
 _LINK_RADIUS_MM = (45.0, 38.0, 30.0, 26.0, 26.0, 24.0, 12.0, 8.0)
 _LEGEND = (
-    "<small>green: poses done · grey: to come · **orange: now** · red: given up · blue box: the "
-    "probe's tip stays inside · magenta: target</small>"
+    "<small>green: poses done · grey: to come · **orange: now** · red: given up · blue: box for the "
+    "probe (tip and housing) · magenta: target</small>"
 )
 
 
@@ -167,7 +167,7 @@ class Page:
         )
         self._parts["box label"] = scene.add_label(
             "/box/label",
-            "box of the tip",
+            "box for the probe",
             position=(high[0], low[1], high[2]),
             anchor="bottom-left",
         )
