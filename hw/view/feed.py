@@ -152,7 +152,7 @@ class LiveView(Audience):
             plan=np.asarray(targets, float)[:, :3].reshape(-1, 12).tolist(),
             box=[list(limits.box_min_mm), list(limits.box_max_mm)],
             tcp_offset=list(plan.tcp_offset),
-            arm=limits.arm_model or "UR5",
+            arm=limits.arm_model,
             image_to_probe=np.asarray(scene.image_to_probe, float).ravel().tolist(),
             point=np.asarray(scene.point_mm, float).tolist(),
             width_mm=float(setup.probe.width_mm),

@@ -40,7 +40,7 @@ from hw.runtime.rigid import looking_rotation
 from hw.setup.description import Setup
 from hw.setup.emulated import setup_of, start
 from hw.view.feed import LiveView, halved, watched
-from hw.view.page import ellipsoid, state_words, to_scale
+from hw.view.page import Page, ellipsoid, state_words, to_scale
 from jaxcal.data.probe import LinearProbe
 
 PLACEMENT = Placement(Bracket(0.1, -0.7, 0.9, 0.3), 0.1, 3, np.zeros((0, 3)))
@@ -278,6 +278,21 @@ def test_the_page_counts_images_and_not_the_poses_of_a_pool(shared_view):
     assert state_words(shared_view._slow) == "**12 of 60 images**"
     shared_view.plan(SETUP, plan, poses, [])
     assert state_words(shared_view._slow) == "**0 of 180 images**"
+
+
+def test_an_unknown_arm_is_not_drawn_as_another_one(shared_view):
+    """A UR5 was drawn, whatever stood there."""
+    shared_view.plan(SETUP, MotionPlan(PLAN.targets, LIMITS, (0.0,) * 6, "none"), PLAN.targets, [])
+    server = viser.ViserServer(host="127.0.0.1", port=8196, verbose=False)
+    try:
+        page = Page(server)
+        pose = PLAN.targets[0][:3].ravel().tolist()
+        page.show({**shared_view._slow, "pose": pose, "joints": [0.0] * 6}, None)
+        shown = [page._parts[f"link {number}"].visible for number in range(8)]
+    finally:
+        server.stop()
+    # One line to the flange, and the probe; no links of an arm.
+    assert shown == [True] + [False] * 7
 
 
 def test_geometry_of_the_page():
