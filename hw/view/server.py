@@ -21,6 +21,8 @@ from typing import Any
 from urllib.parse import urlsplit
 
 HOST = "127.0.0.1"
+_CURE = "install viser 1.1"
+"""The oldest version that pyproject.toml allows, and known to work."""
 _OWN_NAMES = (HOST, "localhost")
 """As a browser names this machine, also at the end of an ssh tunnel."""
 
@@ -106,7 +108,7 @@ def check_refusal(port: int) -> None:
         connection.request("GET", "/", headers={"Host": "elsewhere"})
         if connection.getresponse().status != 403:
             raise NotImplementedError(
-                "this version of viser listens in an unknown way: install viser 1.1"
+                f"this version of viser listens in an unknown way: {_CURE}"
             )
 
 
@@ -123,8 +125,7 @@ def ignore_browsers(server: Any) -> None:
     listener = getattr(server, "_websock_server", None)
     if not callable(getattr(listener, "_handle_incoming_message", None)):
         raise NotImplementedError(
-            "this version of viser handles messages of browsers in an unknown way: install viser "
-            "1.x"
+            f"this version of viser handles messages of browsers in an unknown way: {_CURE}"
         )
 
     async def dropped(client_id: int, message: object) -> None:

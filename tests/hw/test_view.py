@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import time
 from collections.abc import Iterator
@@ -41,9 +42,11 @@ from hw.setup.description import Setup
 from hw.setup.emulated import setup_of, start
 from hw.view.feed import LiveView, halved, watched
 from hw.view.page import Page, ellipsoid, state_words, to_scale
+from hw.view.server import ignore_browsers
 from jaxcal.data.probe import LinearProbe
 
 PLACEMENT = Placement(Bracket(0.1, -0.7, 0.9, 0.3), 0.1, 3, np.zeros((0, 3)))
+ROOT = Path(__file__).parents[2]
 LIMITS = replace(PLAN.limits, arm_model="")
 SCENE = Scene(np.eye(4), np.array([400.0, -100.0, 0.0]), np.array([0.0, 0.0, -1.0]))
 SETUP = Setup("127.0.0.1", "", SCENE, {}, None, probe=LinearProbe(elements=128), clock=Clock())
@@ -293,6 +296,13 @@ def test_an_unknown_arm_is_not_drawn_as_another_one(shared_view):
         server.stop()
     # One line to the flange, and the probe; no links of an arm.
     assert shown == [True] + [False] * 7
+
+
+def test_a_viser_that_cannot_be_served_safely_is_told_with_the_version_that_can():
+    allowed = re.search(r'"viser>=([\d.]+)"', (ROOT / "pyproject.toml").read_text())
+    assert allowed is not None
+    with pytest.raises(NotImplementedError, match=f"install viser {allowed[1]}$"):
+        ignore_browsers(object())
 
 
 def test_geometry_of_the_page():
