@@ -39,8 +39,7 @@ if TYPE_CHECKING:
     from hw.setup.description import Setup
     from hw.view.feed import LiveView
 
-_ALSO_RESUMED = ("bench", "setup_path", "move", "unattended", "preview", "view", "speed",
-                 "controller")  # fmt: skip
+_ALSO_RESUMED = ("bench", "setup_path", "move", "unattended", "view", "speed", "controller")
 """Options that go with --resume."""
 _RESUMED_BY_ITSELF = 30
 """How often an acquisition on the emulated bench is resumed without a person."""
@@ -129,6 +128,8 @@ def acquire(
         raise InputError(f"give either --bench or --setup TOML{also}")
     if not bench and (speed, controller, bench_seed) != (None, None, None):
         raise InputError("--speed, --controller and --bench-seed need --bench")
+    if resume and preview is not None:
+        raise InputError("--preview draws a new plan; it cannot be used with --resume")
     if resume:
         check_resumed(recording, *_ALSO_RESUMED)
     if wanted["operator"] and not resume and wanted["placement"] != "pattern-injection":
@@ -165,8 +166,6 @@ def acquire(
             from hw.acquisition.request import planned
             from hw.planning.poses import preview as draw
 
-            if resume:
-                raise InputError("--preview draws a new plan; it cannot be used with --resume")
             draw(planned(setup, request), Path(preview))
         new = None if resume else request
         return _acquire(setup, path, new, emulated, unattended, operator, view)

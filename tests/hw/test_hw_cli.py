@@ -51,6 +51,7 @@ from hw.runtime.errors import RefusedError
         (["bench", "--controller", "ur5"], "'--controller'"),
         (["check"], "either --bench or --setup"),
         (["bench", "--speed", "0"], "'--speed'"),
+        (["acquire", "r.h5", "--bench", "--resume", "--preview", "p.png"], "draws a new plan"),
         (["fly"], "No such command"),
     ],
 )
