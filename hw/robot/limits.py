@@ -149,20 +149,18 @@ class Limits:
         # A number in metres that means an allowed speed or acceleration is below these bounds.
         between("max_speed_mm_s", self.max_speed_mm_s, 0.25, 250.0)
         between("max_acceleration_mm_s2", self.max_acceleration_mm_s2, 2.0, 2000.0)
-        between("search_mm", self.search_mm, -1.0, 50.0)
-        between("search_deg", self.search_deg, -1.0, 10.0)
+        between("search_mm", self.search_mm, 0.0, 50.0, closed=True)
+        between("search_deg", self.search_deg, 0.0, 10.0, closed=True)
         between("search_speed_mm_s", self.search_speed_mm_s, 0.01, 10.0)
         between("max_pose_age_s", self.max_pose_age_s, 0.0, 0.1)
         between("max_force_n", self.max_force_n, 0.0, 250.0)
         between("max_joint_speed_deg_s", self.max_joint_speed_deg_s, 0.0, 180.0)
-        between("min_singular_value_mm", self.min_singular_value_mm, 0.999, 100.0)
+        between("min_singular_value_mm", self.min_singular_value_mm, 1.0, 100.0, closed=True)
         if self.max_force_n > FORCE_WITHOUT_REASON_N and len(self.force_reason.strip()) < 10:
             raise refused(
                 f"max_force_n of {self.max_force_n:g} N, above {FORCE_WITHOUT_REASON_N:g} N, needs "
                 "a sentence why: force_reason"
             )
-        if self.search_mm < 0 or self.search_deg < 0:
-            raise refused("search_mm and search_deg cannot be negative")
         for low, high in zip(self.joint_min_deg, self.joint_max_deg, strict=True):
             if not -360.0 <= low < high <= 360.0:
                 raise refused("joint_min_deg and joint_max_deg must be in order, within 360 deg")
@@ -251,7 +249,9 @@ def hull_of(
     return tuple((float(x), float(y), float(z)) for x, y, z, _ in placed)
 
 
-def between(name: str, value: float, low: float, high: float) -> None:
-    """Refuse a value that is not above ``low`` and at most ``high``."""
-    if not low < value <= high:
+def between(name: str, value: float, low: float, high: float, *, closed: bool = False) -> None:
+    """Refuse a value that is not above ``low`` (``closed``: nor equal to it) or above ``high``."""
+    if closed and not low <= value <= high:
+        raise refused(f"{name} must be {low:g} to {high:g}, not {value:g}")
+    if not closed and not low < value <= high:
         raise refused(f"{name} must be above {low:g} and at most {high:g}, not {value:g}")
