@@ -73,7 +73,7 @@ class Planner:
     ) -> None:
         scene = setup.scene
         self._targets, self._wanted = targets, until_tre_mm
-        self._speed = float(setup.limits.get("max_speed_mm_s", 50.0))
+        self._speed = float(setup.limits["max_speed_mm_s"])
         self._tip = scene.tip_mm
         model = Model(scene.image_to_probe, scene.point_mm, Noise.constant(BENCH_SDS_MM))
         self._nominal = Candidates(targets, model, constraints_of(scene, setup.extent))
