@@ -378,7 +378,7 @@ class ActiveEcho:
     # Reading
 
     def _read_on(self) -> None:
-        """The reader's thread: an error that nobody expected ends the stream, too, not silently."""
+        """The reader's thread; an unexpected error ends the stream, too, and is told."""
         try:
             self._read_all()
         except Exception as error:

@@ -24,7 +24,8 @@ STOPPED, PLAYING, PAUSED = 1, 2, 4
 NORMAL, REDUCED, PROTECTIVE, SAFEGUARD, SYSTEM_EMERGENCY, ROBOT_EMERGENCY = 1, 2, 3, 5, 6, 7
 """Values of safety_mode; further ones: 4 recovery, 8 violation, 9 fault."""
 RUNNING = 7
-"""Value of robot_mode; further ones: 2 booting, 3 power off, 4 power on, 5 idle (brakes on), 6 backdrive."""
+"""Value of robot_mode; further ones: 2 booting, 3 power off, 4 power on, 5 idle (brakes on), 6
+backdrive."""
 _POWERED = frozenset({4, 5, 6, RUNNING})
 
 _REAL_TIME = frozenset({6, 9, 10, 11, 24, 25, 26, 27, 38, 58, 66, 67, 68, 69, 70, 71})

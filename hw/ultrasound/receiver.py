@@ -250,7 +250,7 @@ class UltrasoundStream:
             )
 
     def _receive(self) -> None:
-        """The receiver's thread: an error that nobody expected ends the stream, too, not silently."""
+        """The receiver's thread; an unexpected error ends the stream, too, and is told."""
         try:
             self._receive_all()
         except Exception as error:

@@ -49,8 +49,8 @@ _GREY, _ARM, _DONE, _NOW, _MISSED = (
 _TARGET = (200, 0, 120)
 _LINK_RADIUS_MM = (45.0, 38.0, 30.0, 26.0, 26.0, 24.0, 12.0, 8.0)
 _LEGEND = (
-    "<small>green: poses done · grey: to come · **orange: now** · red: given up · blue: box for the "
-    "probe (tip and housing) · magenta: target</small>"
+    "<small>green: poses done · grey: to come · **orange: now** · red: given up · blue: box for "
+    "the probe (tip and housing) · magenta: target</small>"
 )
 
 

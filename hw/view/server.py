@@ -107,9 +107,7 @@ def check_refusal(port: int) -> None:
     with closing(http.client.HTTPConnection(HOST, port, timeout=10.0)) as connection:
         connection.request("GET", "/", headers={"Host": "elsewhere"})
         if connection.getresponse().status != 403:
-            raise NotImplementedError(
-                f"this version of viser listens in an unknown way: {_CURE}"
-            )
+            raise NotImplementedError(f"this version of viser listens in an unknown way: {_CURE}")
 
 
 def ignore_browsers(server: Any) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import hashlib
-import io
 import os
 import resource
 import signal
@@ -146,7 +145,9 @@ def test_the_clocks_of_a_resumed_recording_lead_to_its_shifted_times(tmp_path):
 def test_an_answer_that_is_none_ends_the_recording(tmp_path):
     """It ended the thread alone, and the next image waited for half a minute."""
     recorder = Recorder(tmp_path / "r.h5", HEADER)
-    recorder._listen(io.BytesIO(b"printed by a library\n"))
+    (tmp_path / "answers").write_bytes(b"printed by a library\n")
+    with open(tmp_path / "answers", "rb") as answers:
+        recorder._listen(answers)
     with pytest.raises(jaxcal.OutputError, match="JSONDecodeError"):
         recorder.sync()
     with pytest.raises(jaxcal.OutputError, match="JSONDecodeError"):

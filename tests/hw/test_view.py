@@ -182,7 +182,7 @@ def test_a_dead_viewer_is_told_once_and_holds_nothing_up():
 def test_a_feed_that_fails_is_told():
     said = []
     with LiveView(said.append, port=8195, rate_hz=50.0) as view:
-        view.watch(object())  # type: ignore[arg-type]
+        view._session = object()  # type: ignore[assignment]
         wait_until(lambda: len(said) > 1)
     assert said[1].startswith("view: AttributeError: ")
     assert said[1].endswith("; the acquisition goes on without it")
