@@ -283,6 +283,7 @@ def test_the_page_counts_images_and_not_the_poses_of_a_pool(shared_view):
     assert state_words(shared_view._slow) == "**0 of 180 images**"
 
 
+@pytest.mark.filterwarnings("ignore:.control_layout. is deprecated:DeprecationWarning")
 def test_an_unknown_arm_is_not_drawn_as_another_one(shared_view):
     """A UR5 was drawn, whatever stood there."""
     shared_view.plan(SETUP, MotionPlan(PLAN.targets, LIMITS, (0.0,) * 6, "none"), PLAN.targets, [])
