@@ -41,7 +41,7 @@ from hw.midplane.search import PlacementError, first_seen
 from hw.midplane.threshold_climb import threshold_climb
 from hw.recording.recorder import Recorder
 from hw.recording.resuming import compare_electronics, described_electronics
-from hw.recording.session import Session, Watch, median_times
+from hw.recording.session import Session, SilenceLimits, median_times
 from hw.robot.confirmation import Confirmation
 from hw.robot.gate import check_sample
 from hw.robot.motion import Motion
@@ -120,7 +120,7 @@ def acquire(
     emulated: Bench | None = None,
     operator: Callable[[], Operator] = SteadyOperator,
     pause: Pause | None = None,
-    watch: Watch | None = None,
+    watch: SilenceLimits | None = None,
     view: Audience | None = None,
 ) -> Outcome:
     """Run the experiment to its end, or go on with one that ended early.
@@ -239,7 +239,7 @@ class _Run:
         """Bench time."""
         return self.job.setup.clock
 
-    def outcome(self, confirm: Confirm, watch: Watch | None) -> Outcome:
+    def outcome(self, confirm: Confirm, watch: SilenceLimits | None) -> Outcome:
         """Open the devices, have the plan confirmed, take the images, and finish the file."""
         job, recorder, estimator = self.job, self.recorder, self.estimator
         started, before = self.clock.now(), estimator.count

@@ -41,7 +41,7 @@ from hw.recording.resuming import (
     compare_electronics,
     described_electronics,
 )
-from hw.recording.session import DELAY_S, Watch, median_times
+from hw.recording.session import DELAY_S, SilenceLimits, median_times
 from hw.runtime.errors import DeviceError, StaleError
 from hw.runtime.rigid import mean_pose, turn_deg
 from hw.setup.description import HandHeldSetup
@@ -59,7 +59,7 @@ _ANOTHER_DEG = 5.0
 _FASTEST_MM_S = 6.0
 """Fastest motion of a hand whose frames are used: image, pose and echo are known to belong together
 to some 50 ms, which at this speed is 0.3 mm, as much as the element's own accuracy."""
-_LATEST_S = Watch.echo_late_s
+_LATEST_S = SilenceLimits.echo_late_s
 """Frames of the element that are later are not used: the probe was elsewhere then."""
 _AGAIN_S = 1.0
 """After so many seconds the delay of the element's frames is measured again where it is unknown."""

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hw.midplane.bracket import Bracket, Placement
-from hw.midplane.search import Bench, PlacementError, Settings, Walker, Watch, coarse
+from hw.midplane.search import Bench, OnStop, PlacementError, Settings, Walker, coarse
 from jaxcal.runtime.array_types import Float
 
 LEAST_FRACTION = 0.4
@@ -184,7 +184,7 @@ def amplitude_scan(
     bench: Bench,
     settings: Settings | None = None,
     start_mm: float = 0.0,
-    watch: Watch | None = None,
+    watch: OnStop | None = None,
 ) -> Placement:
     """Scan with the robot, fit the maximum, go there.
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from hw.midplane.amplitude_scan import amplitude_scan
 from hw.midplane.bracket import Placement
-from hw.midplane.search import Echoes, Settings, Watch
+from hw.midplane.search import Echoes, OnStop, Settings
 from jaxcal.data.segmentation.image import localise
 from jaxcal.data.segmentation.speckle import SMALLEST_REGION, NotFoundError, envelope_of
 from jaxcal.data.segmentation.spot import brightest
@@ -117,7 +117,7 @@ def image_scan(
     bench: ImageBench,
     settings: Settings | None = None,
     start_mm: float = 0.0,
-    watch: Watch | None = None,
+    watch: OnStop | None = None,
 ) -> Placement:
     """Scan with the robot, fit the maximum of the intensity, go there.
 

@@ -20,7 +20,7 @@ from typing import Literal, Protocol, runtime_checkable
 import numpy as np
 
 from hw.midplane.bracket import Placement
-from hw.midplane.search import Bench, PlacementError, Settings, Walker, Watch, coarse
+from hw.midplane.search import Bench, OnStop, PlacementError, Settings, Walker, coarse
 from hw.runtime.errors import DeviceError
 from jaxcal import InputError
 from jaxcal.runtime.array_types import UInt8
@@ -232,7 +232,7 @@ def pattern_injection(
     *,
     frame: Callable[[], Frame | None] = _no_frame,
     title: str = "",
-    watch: Watch | None = None,
+    watch: OnStop | None = None,
 ) -> Placement:
     """Let an operator find the mid-plane by the injected bar.
 

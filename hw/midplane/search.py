@@ -28,7 +28,7 @@ _ANSWERING_LINES = 4
 _LISTEN_AGAIN = 3
 
 
-Watch = Callable[[float, float, int], None]
+OnStop = Callable[[float, float, int], None]
 """Told of a stop: offset (mm), amplitude (counts), threshold."""
 
 
@@ -179,7 +179,7 @@ class Walker:
     """
 
     def __init__(
-        self, bench: Bench, settings: Settings | None = None, watch: Watch | None = None
+        self, bench: Bench, settings: Settings | None = None, watch: OnStop | None = None
     ) -> None:
         self._bench, self._watch = bench, watch
         self.settings = Settings() if settings is None else settings
@@ -323,7 +323,7 @@ def first_seen(
     bench: Bench,
     settings: Settings | None = None,
     start_mm: float = 0.0,
-    watch: Watch | None = None,
+    watch: OnStop | None = None,
 ) -> Placement:
     """No placement: stop as soon as the element is heard, as conventional practice would.
 

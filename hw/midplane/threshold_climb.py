@@ -15,7 +15,7 @@ import numpy as np
 
 from hw.midplane.amplitude_scan import Peak, scan_up
 from hw.midplane.bracket import Placement
-from hw.midplane.search import Bench, PlacementError, Settings, Walker, Watch, coarse
+from hw.midplane.search import Bench, OnStop, PlacementError, Settings, Walker, coarse
 
 _FIRST_FRACTION = 0.75
 _MOST_ROUNDS = 8
@@ -117,7 +117,7 @@ def threshold_climb(
     bench: Bench,
     settings: Settings | None = None,
     start_mm: float = 0.0,
-    watch: Watch | None = None,
+    watch: OnStop | None = None,
 ) -> Placement:
     """Coarse raster, fine scan, threshold climb; the probe ends half way between the loss edges.
 

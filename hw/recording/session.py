@@ -42,7 +42,8 @@ _MOVED_MM = 0.3
 DELAY_S = 10.0
 """After so many bench seconds the delay of the echo frames is measured again."""
 _RF_ALONE_S = 0.6
-"""RF that comes for so long without a B-mode frame is alone; less than ``Watch.image_age_s``."""
+"""RF that comes for so long without a B-mode frame is alone; less than
+``SilenceLimits.image_age_s``."""
 _LEAST_STAMPS, _MOST_STAMPS, _MOST_FITTED = 20, 20_000, 2_000
 _MOST_DRIFT, _STEP_S = 1e-3, 0.1
 """Two quartz clocks differ by less than this drift; what a busy machine adds to it in all, s."""
@@ -58,7 +59,7 @@ _BAD_FRAMES = {
 
 
 @dataclass(frozen=True)
-class Watch:
+class SilenceLimits:
     """When a device counts as in trouble; times in bench seconds.
 
     Attributes:
@@ -100,11 +101,11 @@ class Session:
         setup: Setup,
         recorder: Recorder,
         *,
-        watch: Watch | None = None,
+        watch: SilenceLimits | None = None,
         every_frame: bool = False,
     ) -> None:
         self.setup, self.clock = setup, setup.clock
-        self.watch = Watch() if watch is None else watch
+        self.watch = SilenceLimits() if watch is None else watch
         self._recorder, self._every_frame = recorder, every_frame
         self._lock, self._changed = lock_and_condition()
         self._echo_frames: deque[EchoFrame] = deque(maxlen=_KEPT_FRAMES)

@@ -45,7 +45,7 @@ from hw.bench.run import Bench
 from hw.midplane.search import PlacementError, Settings
 from hw.planning.poses import Extent
 from hw.recording.resuming import check_same_robot
-from hw.recording.session import Session, Watch
+from hw.recording.session import Session, SilenceLimits
 from hw.robot.confirmation import confirm_unattended
 from hw.robot.motion import Motion
 from hw.robot.motion_plan import MotionPlan
@@ -74,7 +74,7 @@ def run(
     say: Callable[[str], None] = lambda line: None,
     pause: Pause | None = None,
     setup: Setup | None = None,
-    watch: Watch | None = None,
+    watch: SilenceLimits | None = None,
 ) -> Outcome:
     setup = setup_of(bench) if setup is None else setup
 
@@ -501,7 +501,8 @@ def test_a_fault_of_any_device_stops_the_robot_and_the_run_is_resumed(e_series, 
     """One after the other in one recording, which still has no image; the disk's comes last."""
     bench, path = e_series, tmp_path / "rec.h5"
     # A busy machine holds a thread up for more than the 0.12 s that the echo may be silent.
-    setup, watch = quick_setup_of(bench), Watch(echo_age_s=0.5, image_age_s=0.5, grace_s=0.5)
+    setup = quick_setup_of(bench)
+    watch = SilenceLimits(echo_age_s=0.5, image_age_s=0.5, grace_s=0.5)
     request: AcquisitionRequest | None = AcquisitionRequest(4, "none", 1, bench=3)
     for name, (arguments, what) in DEVICE_FAULTS.items():
 

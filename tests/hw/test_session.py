@@ -31,7 +31,7 @@ from hw.bench.world import make_world
 from hw.planning.scene import Scene
 from hw.recording.layout import RecordingHeader
 from hw.recording.recorder import Recorder
-from hw.recording.session import DELAY_S, Session, Watch, frame_period
+from hw.recording.session import DELAY_S, Session, SilenceLimits, frame_period
 from hw.runtime.clock import Clock
 from hw.runtime.errors import DeviceError, RefusedError, StaleError
 from hw.setup.description import Setup
@@ -173,7 +173,7 @@ def test_a_frame_of_before_the_probe_came_to_rest_is_not_measured(tmp_path, monk
                 probe=LinearProbe(elements=8), clock=robot.clock,
             )  # fmt: skip
             with (
-                Session(setup, recorder, watch=Watch(echo_age_s=9.0)) as session,
+                Session(setup, recorder, watch=SilenceLimits(echo_age_s=9.0)) as session,
                 moving(robot, caller_s=2.0) as motion,
             ):
                 session.image_after(robot.clock.now())
@@ -217,7 +217,7 @@ def test_clocks_that_are_wrong_and_images_that_are_lost_are_recorded(tmp_path):
             robot.host, emulator.path, scene, {}, (machine.host, machine.port),
             probe=LinearProbe(elements=8), clock=robot.clock,
         )  # fmt: skip
-        with Session(setup, recorder, watch=Watch(image_age_s=10.0)) as session:
+        with Session(setup, recorder, watch=SilenceLimits(image_age_s=10.0)) as session:
             robot.clock.sleep(DELAY_S + 2.0)
             while len(stamps := session._stamps) < 3 or min(map(len, stamps.values())) < 25:
                 time.sleep(0.01)
@@ -325,7 +325,7 @@ def test_a_suspension_is_no_fault_of_a_device(tmp_path, monkeypatch):
     ):
         probe = LinearProbe(elements=8)
         setup = Setup(robot.host, emulator.path, scene, {}, probe=probe, clock=robot.clock)
-        with Session(setup, recorder, watch=Watch(grace_s=0.5)) as session:
+        with Session(setup, recorder, watch=SilenceLimits(grace_s=0.5)) as session:
             with subprocess.Popen(["sh", "-c", script]):
                 assert len(session.listen(5, robot.clock.now())) == 5
             session.check()
