@@ -16,7 +16,7 @@ from hw.midplane.search import Echoes, PlacementError
 from hw.recording.session import Session
 from hw.robot.motion import Motion
 from hw.robot.stream import PoseSample
-from hw.runtime.errors import RefusedError, StaleError, refused
+from hw.runtime.errors import Device, RefusedError, StaleError, refused
 from hw.runtime.rigid import apart
 from hw.ultrasound.receiver import Image
 from jaxcal.data.segmentation.image import localise
@@ -44,6 +44,10 @@ class ProbeStage:
         targets: (n, 4, 4) poses of the plan, mm.
         note: called with events for the recording: kind, text.
     """
+
+    device: Device = "active echo"
+    target = "the element"
+    to_check = "the element, its threshold and the coupling"
 
     def __init__(
         self,

@@ -13,6 +13,7 @@ import numpy as np
 from hw.active_echo.device import median_of
 from hw.bench.world import World
 from hw.midplane.search import Echoes
+from hw.runtime.errors import Device
 from jaxcal.runtime.array_types import Float
 
 
@@ -49,6 +50,10 @@ class WorldStage:
         backlash_mm: lost motion when the elevational motion changes its direction.
         pace: how long each action takes.
     """
+
+    device: Device = "active echo"
+    target = "the element"
+    to_check = "the element, its threshold and the coupling"
 
     def __init__(
         self,

@@ -19,6 +19,7 @@ import numpy as np
 from hw.midplane.amplitude_scan import amplitude_scan
 from hw.midplane.bracket import Placement
 from hw.midplane.search import Echoes, OnStop, Settings
+from hw.runtime.errors import Device
 from jaxcal.data.segmentation.image import localise
 from jaxcal.data.segmentation.speckle import SMALLEST_REGION, NotFoundError, envelope_of
 from jaxcal.data.segmentation.spot import brightest
@@ -49,6 +50,10 @@ class ImageBench:
             target; it takes longer than the brightest place.
         check: called when the last frame shows something; raises if that frame cannot be trusted.
     """
+
+    device: Device = "ultrasound"
+    target = "the target in the image"
+    to_check = "the gain and the coupling"
 
     def __init__(
         self,

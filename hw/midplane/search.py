@@ -26,6 +26,7 @@ from jaxcal.runtime.array_types import Bool, Float
 _TOP_LINES = 8
 _ANSWERING_LINES = 4
 _LISTEN_AGAIN = 3
+_DEVICE: Device = "active echo"
 
 
 OnStop = Callable[[float, float, int], None]
@@ -35,7 +36,7 @@ OnStop = Callable[[float, float, int], None]
 class PlacementError(DeviceError):
     """A placement was given up; one line says why. The probe is at the last good place, if any."""
 
-    def __init__(self, message: str, *, device: Device = "active echo") -> None:
+    def __init__(self, message: str, *, device: Device = _DEVICE) -> None:
         super().__init__(message, device=device)
 
 
@@ -79,6 +80,13 @@ class Echoes:
 @runtime_checkable
 class Bench(Protocol):
     """What a procedure needs; :class:`hw.acquisition.stage.ProbeStage` has it of real devices."""
+
+    device: Device
+    """By which the target is heard or seen."""
+    target: str
+    """What is looked for, in words."""
+    to_check: str
+    """What to check where it does not respond, in words."""
 
     def move(self, offset_mm: float) -> float:
         """Go there, arrive, settle; returns the offset as tracked, mm."""
@@ -182,6 +190,7 @@ class Walker:
         self, bench: Bench, settings: Settings | None = None, watch: OnStop | None = None
     ) -> None:
         self._bench, self._watch = bench, watch
+        self.target, self.cure = bench.target, f"check {bench.to_check}"
         self.settings = Settings() if settings is None else settings
         self._at: float | None = None
         self.where = 0.0
@@ -195,8 +204,13 @@ class Walker:
     def __enter__(self) -> Walker:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is not None and issubclass(kind, PlacementError):
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, *_: object
+    ) -> None:
+        if isinstance(error, PlacementError):
+            if error.device == _DEVICE:
+                # The search itself gave up.
+                error.device = self._bench.device
             self._leave()
 
     def _move(self, offset: float) -> None:
@@ -252,19 +266,19 @@ class Walker:
         """Go back to the last good place after the response was lost.
 
         Raises:
-            PlacementError: the element is not heard there either, or was never heard.
+            PlacementError: the target does not respond there either, or never did.
         """
         self.set_threshold(self.settings.low_threshold)
         if self.good is None:
-            raise PlacementError("the element was not heard anywhere")
+            raise PlacementError(f"no response of {self.target} anywhere: {self.cure}")
         place = self.good
         for _ in range(_LISTEN_AGAIN):
             self.go(place)
             if self.listen().heard:
                 return
         raise PlacementError(
-            f"the response was lost, and is not heard at {place:+.2f} mm any more, where it "
-            "was: check the element, its threshold and the coupling"
+            f"the response of {self.target} was lost, and is not at {place:+.2f} mm any more, "
+            f"where it was: {self.cure}"
         )
 
     def _leave(self) -> None:
@@ -291,12 +305,12 @@ class Walker:
 
 
 def coarse(walker: Walker, start_mm: float = 0.0) -> float:
-    """Step 1: an elevational raster at the low threshold until the element is heard.
+    """Step 1: an elevational raster at the low threshold until the target responds.
 
     A narrow raster about ``start_mm`` comes first: most plans are nearly right.
 
     Returns:
-        An offset at which the element is heard, mm.
+        An offset at which the target responds, mm.
 
     Raises:
         PlacementError: it is heard nowhere, or a cap was reached.
@@ -314,8 +328,8 @@ def coarse(walker: Walker, start_mm: float = 0.0) -> float:
                 return start_mm + float(offset)
         tried = half
     raise PlacementError(
-        f"no response of the element within {settings.span_mm:g} mm to either side: is it on, is "
-        "the probe coupled, is the plan's pose right?"
+        f"no response of {walker.target} within {settings.span_mm:g} mm to either side: "
+        f"{walker.cure}, and the plan's pose"
     )
 
 

@@ -26,6 +26,7 @@ from hw.bench.world import World, make_world
 from hw.midplane.amplitude_scan import amplitude_scan, fit_peak
 from hw.midplane.bracket import Bracket
 from hw.midplane.image_scan import ImageBench, image_scan, pixel_of, place_of
+from hw.midplane.search import PlacementError
 from hw.planning.poses import plan_poses
 from hw.recording.check import check_resumable, read_progress, settings_of
 from hw.recording.layout import RecordingHeader
@@ -185,6 +186,16 @@ def test_the_image_scan_puts_the_crossing_into_the_plane_and_locates_it():
     # The echo comes from the surface of the wire, 0.1 mm nearer, and scatters by 0.1 mm.
     assert np.abs(np.mean(errors, axis=0) - [0.0, -0.1]).max() < 0.1
     assert np.std(errors, axis=0).max() < 0.2
+
+
+def test_a_search_by_image_that_finds_nothing_does_not_blame_the_element():
+    bench = ImageBench(lambda at: at, lambda: np.zeros((480, 640), np.uint8), (320.0, 240.0), 120.0)
+    with pytest.raises(PlacementError) as told:
+        image_scan(bench)
+    assert str(told.value) == (
+        "ultrasound: no response of the target in the image within 9 mm to either side: check the "
+        "gain and the coupling, and the plan's pose"
+    )
 
 
 def test_pixels_and_places_are_each_others_inverse():
