@@ -39,7 +39,7 @@ from hw.midplane.pattern_injection import (
 )
 from hw.midplane.search import PlacementError, first_seen
 from hw.midplane.threshold_climb import threshold_climb
-from hw.recording.recorder import Recorder
+from hw.recording.recorder import Recorder, no_digest
 from hw.recording.resuming import compare_electronics, described_electronics
 from hw.recording.session import Session, SilenceLimits, median_times
 from hw.robot.confirmation import Confirmation
@@ -258,6 +258,8 @@ class _Run:
         # A pool has other poses for those without an image.
         again = without if job.request.plan == "sobol" else ()
         digest = _finish(recorder, len(again))
+        if recorder.digest_error is not None:
+            self.say(no_digest(recorder.digest_error))
         return Outcome(
             estimator.count,
             estimator.count - before,

@@ -14,7 +14,7 @@ from hw.freehand.posed import PosedImages
 from hw.freehand.request import FreeHand, FreeHandStopped, Person
 from hw.recording.check import last_host_time, opened, read_column, resumed_offset_s
 from hw.recording.file import RecordingWriter
-from hw.recording.recorder import Recorder
+from hw.recording.recorder import Recorder, no_digest
 from hw.runtime.clock import REAL
 from hw.runtime.errors import DeviceError
 from jaxcal import CalibrationError, InputError
@@ -124,6 +124,8 @@ class Run(ABC):
             raise InputError(f"{count} images are too few: {MINIMUM_IMAGES} are needed")
         self.note("finished", f"{count} images")
         self.recorder.finish()
+        if self.recorder.digest_error is not None:
+            self.person.say(no_digest(self.recorder.digest_error))
         return count
 
     @abstractmethod

@@ -78,6 +78,7 @@ class RecordingWriter:
     def __init__(self, path: Path, file: h5py.File) -> None:
         self.path = path
         self.reserve_bytes = RESERVE_BYTES
+        self.digest_error: str | None = None
         self._file = file
         # A duplicate of HDF5's descriptor: it leads to the same file whatever becomes of the path.
         self._descriptor = os.dup(file.id.get_vfd_handle())
@@ -383,7 +384,7 @@ class RecordingWriter:
 
         Returns:
             The hexadecimal digest of the file that was written; ``sha256sum -c`` reads the sidecar
-            ``<file>.sha256``.
+            ``<file>.sha256``. If that cannot be written, ``digest_error`` says why.
 
         Raises:
             OutputError: the disk is full, or the path leads to another file.
@@ -399,7 +400,11 @@ class RecordingWriter:
                 busy()
         self._check_place()
         self._forget()
-        write_text(_sidecar(self.path), f"{digest.hexdigest()}  {self.path.name}\n")
+        try:
+            write_text(_sidecar(self.path), f"{digest.hexdigest()}  {self.path.name}\n")
+        except OutputError as error:
+            # The recording itself is complete: there is nothing to resume.
+            self.digest_error = str(error)
         return digest.hexdigest()
 
     def _prepare(self, name: str, columns: Mapping[str, np.ndarray]) -> dict[str, h5py.Dataset]:

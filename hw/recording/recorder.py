@@ -86,6 +86,8 @@ class Recorder:
         """The first error of the writer; None as long as it writes."""
         self.kept = self.path
         """Where the rows are: maybe another path, if the file was moved, removed or replaced."""
+        self.digest_error: str | None = None
+        """Why a finished recording has no SHA-256 digest beside it; None if it has one."""
         self._ending = self._ended = self._closed = self._hung = False
         self._unsent = False
         """Whether something handed over did not reach the writer."""
@@ -322,14 +324,17 @@ class Recorder:
     def finish(self) -> str:
         """Mark the recording complete and end; returns the SHA-256 digest of the file.
 
+        If the digest cannot be written beside the file, :attr:`digest_error` says why.
+
         Raises:
             OutputError: the writer failed; the file is incomplete then.
         """
         self._note_drops()
         self._put("finish")
-        digest = self._answer("finish")["sha256"]
+        answer = self._answer("finish")
+        self.digest_error = answer["digest_error"]
         self._stop()
-        return digest
+        return answer["sha256"]
 
     def close(self) -> None:
         """Write what waits and close the file; it stays incomplete unless it was finished.
@@ -519,3 +524,8 @@ class Recorder:
 
 def _column(items: Sequence[Any], name: str, kind: type = float) -> np.ndarray:
     return np.array([getattr(item, name) for item in items], kind)
+
+
+def no_digest(reason: str) -> str:
+    """A line for a person where :attr:`Recorder.digest_error` is set."""
+    return f"the recording is complete, but has no SHA-256 digest beside it: {reason}"

@@ -111,7 +111,8 @@ def _serve(writer: RecordingWriter, messages: queue.Queue, answer: Callable[...,
             due = None
             answer(mark=arguments[0])
         elif do == "finish":
-            answer(mark="finish", sha256=writer.finish(lambda: answer(busy=True)))
+            digest = writer.finish(lambda: answer(busy=True))
+            answer(mark="finish", sha256=digest, digest_error=writer.digest_error)
             return
         else:
             getattr(writer, do)(*arguments)

@@ -154,6 +154,19 @@ def test_an_answer_that_is_none_ends_the_recording(tmp_path):
         recorder.close()
 
 
+def test_a_digest_that_cannot_be_written_leaves_the_recording_complete(tmp_path):
+    """The run failed and advised to resume, which answers that the recording is complete."""
+    path = tmp_path / "r.h5"
+    recorder = Recorder(path, HEADER)
+    (tmp_path / "r.h5.sha256").mkdir()
+    assert recorder.finish() == hashlib.sha256(path.read_bytes()).hexdigest()
+    assert recorder.digest_error is not None
+    assert "r.h5.sha256" in recorder.digest_error
+    recorder.close()
+    with h5py.File(path) as file:
+        assert file.attrs["complete"]
+
+
 def test_signals_that_end_all_processes_leave_the_writer_to_the_acquisition(tmp_path):
     """At a system's shutdown: why the run has ended must still be written."""
     path = tmp_path / "rec.h5"
