@@ -324,7 +324,7 @@ class Recorder:
     def finish(self) -> str:
         """Mark the recording complete and end; returns the SHA-256 digest of the file.
 
-        If the digest cannot be written beside the file, :attr:`digest_error` says why.
+        If the digest cannot be written beside the file, ``digest_error`` says why.
 
         Raises:
             OutputError: the writer failed; the file is incomplete then.
