@@ -30,7 +30,8 @@ import numpy as np
 from common import arguments, machine, save_figure, write_table
 from matplotlib.figure import Figure
 
-from hw.bench.robot import CB_SERIES, E_SERIES, START, EmulatedRobot
+from hw.bench.robot import START, EmulatedRobot
+from hw.bench.rtde import CB_SERIES, E_SERIES
 from hw.robot.confirmation import confirm_unattended
 from hw.robot.identity import read_identity
 from hw.robot.limits import Limits

@@ -41,7 +41,8 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 
 from hw.bench.joints import Motion as ArmMotion
-from hw.bench.robot import CB_SERIES, E_SERIES, START, EmulatedRobot
+from hw.bench.robot import START, EmulatedRobot
+from hw.bench.rtde import CB_SERIES, E_SERIES
 from hw.robot.confirmation import confirm_unattended
 from hw.robot.identity import read_identity
 from hw.robot.limits import Limits

@@ -16,7 +16,8 @@ from hw.bench.arm import Arm
 from hw.bench.control import ControlServer
 from hw.bench.frames import Camera
 from hw.bench.phantoms import phantom_named
-from hw.bench.robot import CB_SERIES, E_SERIES, RobotProcess, model_of
+from hw.bench.robot import RobotProcess, model_of
+from hw.bench.rtde import CB_SERIES, E_SERIES
 from hw.bench.ultrasound import ImageServer
 from hw.bench.world import World, make_world
 from hw.planning.scene import Scene

@@ -22,15 +22,12 @@ from typing import Any
 
 from hw.bench.arm import Arm
 from hw.bench.joints import Motion
-from hw.bench.rtde import RtdeServer
+from hw.bench.rtde import E_SERIES, RtdeServer
 from hw.runtime.clock import REAL, Clock
 from hw.runtime.processes import ANSWERS, be_prompt, finish, spawn
 
 START = (0.4, -0.1, 0.3, 0.0, 3.0, 0.2)
 """Where the arm starts by default: m and rotation vector (rad)."""
-
-E_SERIES, CB_SERIES = (5, 11, 0, 108249), (3, 15, 8, 106339)
-"""Controller versions of the two series of robots."""
 
 _PATIENCE_S = 30.0
 

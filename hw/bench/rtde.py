@@ -43,10 +43,13 @@ from hw.robot.identity import (
     ROBOT_STATE,
 )
 from hw.robot.kinematics import MODELS
+from hw.robot.rtde import PORT, SCRIPT_PORT, nominal_hz
 from hw.runtime.clock import REAL, Clock
 from hw.runtime.processes import ANSWERS, be_prompt
 
-DASHBOARD, PRIMARY, SCRIPT, RTDE = DASHBOARD_PORT, PRIMARY_PORT, 30003, 30004
+DASHBOARD, PRIMARY, SCRIPT, RTDE = DASHBOARD_PORT, PRIMARY_PORT, SCRIPT_PORT, PORT
+E_SERIES, CB_SERIES = (5, 11, 0, 108249), (3, 15, 8, 106339)
+"""Controller versions of the two series of robots."""
 _MAX_WAITING = 1 << 16
 """Bytes that may wait for a client that does not read; further packets for it are dropped."""
 _ROBOT_MESSAGE = 20
@@ -92,15 +95,14 @@ class RtdeServer:
         arm: Arm,
         host: str = "127.0.0.2",
         *,
-        version: tuple[int, int, int, int] = (5, 11, 0, 108249),
+        version: tuple[int, int, int, int] = E_SERIES,
         clock: Clock = REAL,
         max_rate_hz: float = 1000.0,
         serial: str = "20195500042",
     ) -> None:
         self.arm, self.host, self.version, self.clock = arm, host, version, clock
         self.serial = serial
-        nominal = 500.0 if version[0] >= 5 else 125.0
-        self.frequency_hz = min(nominal, max_rate_hz / clock.speed)
+        self.frequency_hz = min(nominal_hz(version[0]), max_rate_hz / clock.speed)
         self.controller = Controller(arm, told=self._say_why)
         self.asked: list[str] = []
         """Every line that the dashboard was sent."""

@@ -47,7 +47,7 @@ class Peak:
 def fit_peak(
     offsets_mm: Float[np.ndarray, " n"],
     amplitudes: Float[np.ndarray, " n"],
-    full_scale: float = 4095.0,
+    full_scale: float = Settings.full_scale,
 ) -> Peak:
     """The maximum of a Gaussian profile, by a parabola through the logarithm.
 

@@ -25,7 +25,8 @@ from typing import Any
 from hw.runtime.clock import monotonic_s
 from hw.runtime.errors import LostError, refused
 
-PORT = 30004
+PORT, SCRIPT_PORT = 30004, 30003
+"""Of a controller: real-time data, and programs that it runs at once."""
 
 FIELDS: dict[str, tuple[str, str]] = {
     "timestamp": ("DOUBLE", "d"),
@@ -344,7 +345,7 @@ class PacketReader:
         if len(answer) != 16:
             raise LostError("the controller did not report its version", device="robot")
         self.version: tuple[int, ...] = struct.unpack(">4I", answer)
-        self.frequency_hz = frequency_hz or (500.0 if self.version[0] >= 5 else 125.0)
+        self.frequency_hz = frequency_hz or nominal_hz(self.version[0])
         names = list(FIELDS)
         types = self._recipe(names, deadline)
         lacking = [
@@ -451,3 +452,8 @@ class PacketReader:
             if not data:
                 raise LostError("the controller closed the connection", device="robot")
             self._data += data
+
+
+def nominal_hz(major: int) -> float:
+    """Packets a second of a controller, by the first number of its version: e-Series has 5."""
+    return 500.0 if major >= 5 else 125.0

@@ -6,7 +6,8 @@ import itertools
 import os
 
 import hw.bench.robot
-from hw.bench.robot import CB_SERIES, E_SERIES, START
+from hw.bench.robot import START
+from hw.bench.rtde import CB_SERIES, E_SERIES
 
 __all__ = ["CB_SERIES", "E_SERIES", "START", "EmulatedRobot", "address"]
 

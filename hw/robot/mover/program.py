@@ -18,10 +18,10 @@ from collections.abc import Callable
 from typing import Any
 
 from hw.robot.mover.controller import said
+from hw.robot.rtde import SCRIPT_PORT
 from hw.runtime.errors import LostError
 from hw.runtime.processes import be_prompt
 
-_SCRIPT_PORT = 30003
 _LAST_LINE = b"# NODE_CONTROL_LOOP_ENDS\n"
 _PATIENCE_S = 10.0
 
@@ -101,7 +101,7 @@ def send_program(
         LostError: the controller does not take it.
     """
     try:
-        sent = connect((host, _SCRIPT_PORT), _PATIENCE_S)
+        sent = connect((host, SCRIPT_PORT), _PATIENCE_S)
         sent.sendall(program)
     except OSError as error:
         raise LostError(f"the controller took no program: {error}", device="robot") from None
