@@ -422,9 +422,14 @@ def _alike_for(problem: Problem, estimate: tuple[str, ...]) -> float:
 
 def _moves_continuously(poses: Float[np.ndarray, "n 4 4"]) -> bool:
     """Whether successive poses are much closer to each other than any two poses are."""
+    return step_share(poses) < CONTINUOUS_SHARE
+
+
+def step_share(poses: Float[np.ndarray, "n 4 4"]) -> float:
+    """The step from image to image over the distance of poses half a recording apart; medians."""
     steps = displacement(poses[1:], poses[:-1])
     apart = displacement(poses, np.roll(poses, len(poses) // 2, axis=0))
-    return bool(np.median(steps) < CONTINUOUS_SHARE * np.median(apart))
+    return float(np.median(steps) / max(np.median(apart), 1e-300))
 
 
 def alike_for(errors: Float[np.ndarray, "n k"]) -> float:

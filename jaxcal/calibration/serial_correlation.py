@@ -17,9 +17,15 @@ residuals (profiled over the variance), times a prior: half for no correlation, 
 spread evenly over the grid. The other kinds enter with their mean weights, in turn. C_k is then the
 weighed mean, which is the law of total variance, since every pair has the same estimate. So SDs
 grow by one to three percent where errors look independent and the poses change at random; nothing
-decides whether errors are correlated. Few images along a slow path cannot tell a drift from a
-movement: their SDs grow even if their errors are independent. The correction makes no answer more
-certain. The information P of priors on sound speed and delay is added to both sums.
+decides whether errors are correlated. The correction makes no answer more certain. The information
+P of priors on sound speed and delay is added to both sums.
+
+*Slow paths.* Where the probe was placed anew for every image, errors have little reason to stay
+alike for long. Where it moved slowly all the time, whatever depends on its motion did so, too, and
+few images along such a path cannot tell a drift from a movement. Then the grid has integrated
+autocorrelation times t of up to several times the number of images, and beside the correlation
+above a smoother one, of an autoregression of second order with both roots at rho. The share of this
+grid in the prior follows from the size of the steps (:func:`slowness`).
 
 The cosine transform of a stationary series has nearly independent coefficients, whose variances are
 the spectral density. So no matrix of all images is formed: C_k is diagonal there.
@@ -35,6 +41,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from jaxcal.calibration.dependence import step_share
 from jaxcal.diagnostics.image_errors import further_prior
 from jaxcal.diagnostics.influence import WhitenedErrors, whitened_errors
 from jaxcal.model.unknowns import block_slice
@@ -45,14 +52,22 @@ from jaxcal.runtime.arrays import batch_of_one, like
 CORRELATIONS = np.arange(0.04, 1.0, 0.08)
 """Correlations of the correlated part of successive errors that are weighed."""
 
+SLOW_SHARE, RANDOM_SHARE = 0.2, 0.4
+"""Steps between images, as shares of the distance of poses half a recording apart: up to the first
+one a path is slow, and from the second one on poses change at random."""
+
+TIMES, SHORTEST_TIME, LONGEST_TIMES = 10, 1.15, 8.0
+"""Number of autocorrelation times that are weighed along a slow path, the shortest one in images,
+and the longest one in numbers of all images."""
+
 SHARES = np.array([1 / 3, 2 / 3, 1.0])
 """Shares of the variance that are correlated."""
 
 INDEPENDENT = 0.5
 """Prior probability that errors of one kind are independent."""
 
-FEWEST_SUCCESSIVE = 20
-"""With fewer used images the correlation is not estimated."""
+FEWEST_SUCCESSIVE, FEWEST_SLOW = 20, 10
+"""With fewer used images the correlation is not estimated; the second number is for slow paths."""
 
 ROUNDING_MM = 1e-9
 """Errors with smaller SDs are rounding."""
@@ -76,21 +91,24 @@ def widened(result: Calibration) -> Calibration:
         result: of one problem, with concrete values.
 
     Returns:
-        Calibrations from channels, with bounded offsets or with fewer than ``FEWEST_SUCCESSIVE``
-        images are returned unchanged.
+        Calibrations from channels, with bounded offsets or with too few images
+        (:data:`FEWEST_SUCCESSIVE`) are returned unchanged.
     """
     if not widens(result.data == "channels", result.prior) or result.problem is None:
         return result
     covariance = np.asarray(result.unknowns_covariance)
     # Counted by numpy, since JAX would compile the count anew for every number of images.
-    used = int(np.sum(np.asarray(result.mask) > 0))
-    if not np.isfinite(covariance).all() or used < FEWEST_SUCCESSIVE:
+    if not np.isfinite(covariance).all():
+        return result
+    used = np.asarray(result.mask) > 0
+    slow = slowness(np.asarray(result.problem.poses, float)[used])
+    if used.sum() < (FEWEST_SLOW if slow else FEWEST_SUCCESSIVE):
         return result
     if np.max(np.asarray(result.sigma)) < ROUNDING_MM:
         return result
     answer = batch_of_one(result)
     whitened = whitened_errors(answer)
-    before, after = _covariances(whitened, further_prior(answer)[0])
+    before, after = _covariances(whitened, further_prior(answer)[0], slow)
     linearisation = result.linearisation
     # The information about all unknowns changes in the same proportion.
     variance = float(linearisation.variance)
@@ -121,16 +139,23 @@ def _wider_medium(
     return medium if medium is None else replace(medium, **changed)
 
 
+def slowness(poses: Float[np.ndarray, "n 4 4"]) -> float:
+    """1 along a slow path, 0 where poses change at random, by the size of the steps."""
+    if len(poses) < FEWEST_SLOW:
+        return 0.0
+    return float(np.interp(step_share(poses), [SLOW_SHARE, RANDOM_SHARE], [1.0, 0.0]))
+
+
 def _covariances(
-    whitened: WhitenedErrors, precision: Float[np.ndarray, " p"]
+    whitened: WhitenedErrors, precision: Float[np.ndarray, " p"], slow: float
 ) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "p p"]]:
     """Covariances of the unknowns without and with the correlation."""
     errors, rows, prior = whitened.errors, whitened.rows, np.diag(precision)
     inverse, before = whitened.covariances(precision)
-    spectra = _spectra(len(errors))
+    spectra, belief = _models(len(errors), slow)
     waves = _cosine_transform(np.concatenate([rows, errors[..., None]], axis=2))
     middle = prior
-    for k, factor in enumerate(_factors(waves, spectra, prior)):
+    for k, factor in enumerate(_factors(waves, spectra, belief, prior)):
         along = waves[:, k, :-1]
         middle = middle + whitened.variances[k] * (along.T * (factor @ spectra)) @ along
     lower = _lower(before)
@@ -151,23 +176,64 @@ def _cosine_transform(values: Float[np.ndarray, "n k q"]) -> Float[np.ndarray, "
     return found
 
 
-def _spectra(count: int) -> Float[np.ndarray, "g n"]:
-    """Variances of the cosine transform of errors with variance 1; the first are independent."""
-    rho, share = CORRELATIONS[:, None, None], SHARES[:, None]
-    density = (1 - rho**2) / (1 - 2 * rho * np.cos(np.pi * np.arange(count) / count) + rho**2)
-    density = density / density.mean(axis=-1, keepdims=True)
-    correlated = (1 - share + share * density).reshape(-1, count)
-    return np.concatenate([np.ones((1, count)), correlated])
+def _models(count: int, slow: float) -> tuple[Float[np.ndarray, "g n"], Float[np.ndarray, " g"]]:
+    """Variances of the cosine transform of errors with variance 1, and the prior of each model.
+
+    Args:
+        count: number of images.
+        slow: share of the models of a slow path, from 0 to 1.
+    """
+    usual = (1 - slow) * (count >= FEWEST_SUCCESSIVE)
+    spectra, belief = [np.ones((1, count))], [np.array([1 - (1 - INDEPENDENT) * (usual + slow)])]
+    for share, make in ((usual, _usual_spectra), (slow, _slow_spectra)):
+        if share > 0:
+            spectra.append(made := make(count))
+            belief.append(np.full(len(made), (1 - INDEPENDENT) * share / len(made)))
+    return np.concatenate(spectra), np.concatenate(belief)
+
+
+def _usual_spectra(count: int) -> Float[np.ndarray, "g n"]:
+    """Of a correlation rho^|i - j|."""
+    return _partly(1 / _distance(CORRELATIONS, count))
+
+
+def _slow_spectra(count: int) -> Float[np.ndarray, "g n"]:
+    """Of the first and second order, by their autocorrelation times."""
+    time = np.geomspace(SHORTEST_TIME, LONGEST_TIMES * count, TIMES)
+    # By 1 - rho, the time of the second order, (1 + rho)^3 / ((1 - rho) (1 + rho^2)).
+    left = np.geomspace(1.0, 1e-7, 1000)
+    smooth = (2 - left) ** 3 / (left * (1 + (1 - left) ** 2))
+    second = 1 - np.exp(np.interp(np.log(time), np.log(smooth), np.log(left)))
+    first = (time - 1) / (time + 1)
+    found = 1 / _distance(first, count), 1 / _distance(second, count) ** 2
+    return np.concatenate([_partly(density) for density in found])
+
+
+def _distance(rho: Float[np.ndarray, " r"], count: int) -> Float[np.ndarray, "r n"]:
+    """|1 - rho exp(i w)|^2 at the frequencies w of the cosine transform."""
+    rho = rho[:, None]
+    return 1 - 2 * rho * np.cos(np.pi * np.arange(count) / count) + rho**2
+
+
+def _partly(density: Float[np.ndarray, "r n"]) -> Float[np.ndarray, "g n"]:
+    """Spectra of errors of which each of the shares is correlated so."""
+    share = SHARES[:, None]
+    density = (density / density.mean(axis=-1, keepdims=True))[:, None]
+    return (1 - share + share * density).reshape(-1, density.shape[-1])
 
 
 def _factors(
-    waves: Float[np.ndarray, "n 3 q"], spectra: Float[np.ndarray, "g n"], prior: np.ndarray
+    waves: Float[np.ndarray, "n 3 q"],
+    spectra: Float[np.ndarray, "g n"],
+    belief: Float[np.ndarray, " g"],
+    prior: Float[np.ndarray, "p p"],
 ) -> Float[np.ndarray, "3 g"]:
     """Weight of every spectrum times the variance under it, for every kind of error.
 
     Args:
         waves: cosine transforms of the unknowns' rows and, last, of the errors.
         spectra: of all models of the correlation.
+        belief: their prior probabilities.
         prior: (q - 1, q - 1) information about the unknowns.
 
     Returns:
@@ -181,8 +247,6 @@ def _factors(
     whole = np.zeros((size, size))
     whole[:-1, :-1] = prior
     log_det = np.log(spectra).sum(axis=1)
-    before = np.full(len(spectra), (1 - INDEPENDENT) / (len(spectra) - 1))
-    before[0] = INDEPENDENT
     weight = np.tile(np.eye(1, len(spectra)), (kinds, 1))
     variance = np.ones((kinds, len(spectra)))
 
@@ -203,7 +267,7 @@ def _factors(
                 continue
             cost = _restricted_cost(others + weighed[k] / variance[k][:, None, None])
             twice = cost + count * np.log(variance[k]) + log_det
-            likelihood = before * np.exp(-0.5 * (twice - twice.min()))
+            likelihood = belief * np.exp(-0.5 * (twice - twice.min()))
             weight[k] = likelihood / likelihood.sum()
     return weight * variance / variance[:, :1]
 
