@@ -4,7 +4,9 @@ Holds: k poses with m frames each, 60 in all; every frame adds 0.05 mm of jitter
 errors and offset belong to the hold. Sweeps: 20 frames a second of a probe that moves slowly, with
 offsets (and a part of the other errors) that change over about a second. Paths: 24 to 100 frames,
 0.3 s apart, of the same movement (or of one in random order), with offsets and errors that have a
-given correlation in successive frames. Each trial is calibrated twice: with every frame as an image
+given correlation in successive frames. Smooth sweeps: 12 to 100 frames, 0.05 to 0.5 s apart, of a
+shorter and quieter movement (errors of 0.12 and 0.06 mm), with offsets as smooth as the movement
+itself, or drawn anew for each frame. Each trial is calibrated twice: with every frame as an image
 of its own (``jaxcal.calibrate_batch``), and by ``jaxcal.calibrate``, which takes one image for each
 different pose and, of a sweep, every so many (:mod:`jaxcal.calibration.dependence`), and widens the
 covariance for errors that are alike in successive images
@@ -39,6 +41,8 @@ NOISE_MM = np.array([0.4, 0.2])
 """SDs of lateral position and range."""
 OFFSET_MM = 1.0
 """Offsets of holds are uniform within this."""
+QUIET_MM = np.array([0.12, 0.06])
+"""The SDs in smooth sweeps."""
 RATE_HZ = 20
 HEADER = [
     "condition", "frames_as", "trials", "refused", "not_converged", "images_mean",
@@ -126,14 +130,24 @@ def along(count: int, correlation: float, rng: np.random.Generator, shuffled=Fal
 
 def moved(time: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Rotations, and where the target lies in the mid-plane, at times (s) of a smooth movement."""
+    turns = np.stack([waves(time, 0.35, rng) for _ in range(3)], axis=1)
+    lateral, axial = waves(time, 20, rng), 45 + waves(time, 22, rng)
+    return Rotation.from_rotvec(turns).as_matrix(), np.stack([lateral, 0 * time, axial], axis=1)
 
-    def path(size: float) -> np.ndarray:
-        periods, phases = rng.uniform(6, 20, 2), rng.uniform(0, 2 * np.pi, 2)
-        waves = np.sin(2 * np.pi * time[:, None] / periods + phases)
-        return size * waves @ [0.7, 0.5]
 
-    rotations = Rotation.from_rotvec(np.stack([path(0.35) for _ in range(3)], axis=1))
-    return rotations.as_matrix(), np.stack([path(20), 0 * time, 45 + path(22)], axis=1)
+def waves(time: np.ndarray, size: float, rng: np.random.Generator) -> np.ndarray:
+    """The sum of two sines, of random periods (s) and phases, at these times."""
+    periods, phases = rng.uniform(6, 20, 2), rng.uniform(0, 2 * np.pi, 2)
+    return size * np.sin(2 * np.pi * time[:, None] / periods + phases) @ [0.7, 0.5]
+
+
+def smooth(count: int, step_s: float, rng: np.random.Generator, *, anew: bool = False) -> Frames:
+    """Frames of a moving probe whose offsets are as smooth as the movement, or drawn anew."""
+    time = step_s * np.arange(count)
+    rotations, q = moved(time, rng)
+    q[:, 1] = 0.5 * rng.normal(size=count) if anew else waves(time, 0.8, rng)
+    transform, poses = placed(q, rotations, rng)
+    return Frames(poses, seen(q) + QUIET_MM * rng.normal(size=(count, 2)), transform)
 
 
 def seen(q: np.ndarray) -> np.ndarray:
@@ -170,6 +184,13 @@ CONDITIONS: dict[str, Callable[[np.random.Generator], Frames]] = {
     "path of 100, correlation 0.6": lambda rng: along(100, 0.6, rng),
     "random order of 40, correlation 0": lambda rng: along(40, 0.0, rng, shuffled=True),
     "random order of 40, correlation 0.6": lambda rng: along(40, 0.6, rng, shuffled=True),
+    "smooth sweep of 12, 0.5 s apart": lambda rng: smooth(12, 0.5, rng),
+    "smooth sweep of 20, 0.5 s apart": lambda rng: smooth(20, 0.5, rng),
+    "smooth sweep of 30, 0.5 s apart": lambda rng: smooth(30, 0.5, rng),
+    "smooth sweep of 100, 0.05 s apart": lambda rng: smooth(100, 0.05, rng),
+    "sweep of 12, 0.5 s apart, offsets anew": lambda rng: smooth(12, 0.5, rng, anew=True),
+    "sweep of 20, 0.5 s apart, offsets anew": lambda rng: smooth(20, 0.5, rng, anew=True),
+    "sweep of 30, 0.5 s apart, offsets anew": lambda rng: smooth(30, 0.5, rng, anew=True),
 }
 
 

@@ -31,6 +31,7 @@ from jaxcal.data.problem import Channels
 from jaxcal.data.recording import make_images
 from jaxcal.diagnostics import frame_checks
 from jaxcal.diagnostics.influence import WhitenedErrors, influence_of, whitened_errors
+from jaxcal.model.image_points import distance
 from jaxcal.report.accuracy import GOOD_MM
 from jaxcal.report.record import calibration_record, further_unknowns
 from jaxcal.runtime.arrays import batch_of_one
@@ -230,6 +231,32 @@ def test_errors_hardly_widen_a_covariance_where_poses_change_at_random():
     _, correlated_errors = _linear_answers(lambda rng: rng.permutation(40), 0.6)
     assert independent_errors.mean() < 1.04
     assert correlated_errors.mean() < 1.3
+
+
+def _good_and_wrong(made) -> tuple[bool, bool]:
+    """Whether the verdict is good or fair, and whether the error is then above its interval."""
+    result = jaxcal.calibrate(jaxcal.Problem.from_arrays(made.poses, made.points))
+    record = result.record()
+    if record["verdict"] not in ("good", "fair"):
+        return False, False
+    error = distance(
+        np.asarray(result.image_to_probe), made.image_to_probe, np.ones(2), made.points, 0.0
+    )
+    return True, bool(error > record["tre"]["interval_95_mm"][1])
+
+
+@pytest.mark.parametrize(("count", "step_s", "most"), [(15, 0.5, 2), (30, 0.5, 1), (100, 0.05, 1)])
+def test_a_smooth_sweep_is_seldom_good_and_wrong(frames, count, step_s, most):
+    """Its offsets change as slowly as its poses. Without such models 9, 5 and 6 were."""
+    made = [frames.smooth(count, step_s, np.random.default_rng([3, k])) for k in range(20)]
+    assert sum(_good_and_wrong(one)[1] for one in made) <= most
+
+
+def test_a_slow_path_is_believed_where_offsets_were_drawn_anew(frames):
+    made = [frames.smooth(30, 0.5, np.random.default_rng([4, k]), anew=True) for k in range(8)]
+    good, wrong = np.sum([_good_and_wrong(one) for one in made], axis=0)
+    assert good >= 7
+    assert wrong == 0
 
 
 def test_cosine_transform_is_scipys():

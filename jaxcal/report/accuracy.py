@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from jaxcal import InputError
+from jaxcal.calibration.serial_correlation import slowness
 from jaxcal.data.poses import targets_in_images
 from jaxcal.data.recording import LARGEST, Recording
 from jaxcal.design.candidates import seen_region
@@ -74,6 +75,7 @@ def accuracy_record(
     tre["unmodelled"] = _unmodelled(answer, grid, recording.calibration.velocity)
     away = away_from_gaussian(answer, grid)
     tre["gaussian_offsets"] = away and dict(zip(("apart_mm", "error_mm"), away, strict=True))
+    tre["slow_path"] = slowness(recording.calibration.poses[np.asarray(answer.mask) > 0])
     agreeing = agreeing_outliers(answer, float(tre["stated_mm"]), grid)
     tre["left_out"] = agreeing and dict(zip(("images", "apart_mm"), agreeing, strict=True))
     return {

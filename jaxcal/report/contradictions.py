@@ -11,6 +11,8 @@ The covariance assumes that the noise model holds. It is contradicted if
 - test images scatter far more than the calibration explains;
 - the errors within the image drift, come in two groups, or would be explained by an error that the
   model leaves out (:mod:`jaxcal.diagnostics.unmodelled`);
+- along a slow path the offsets are far smaller than all other errors: those that changed as slowly
+  as the pose have moved the answer instead;
 - images that were left out as outliers agree among themselves on another calibration
   (:mod:`jaxcal.diagnostics.outlier_agreement`);
 - offsets are bounded or uniform, and the fit with Gaussian offsets is far away
@@ -39,6 +41,10 @@ LIMITS_TIMES = 1.25
 Gaussian offsets than so many times the error of that fit."""
 SCATTER_TIMES = 1.3
 """Resampled calibrations may scatter by up to so many times the stated error."""
+
+ABSORBED_SHARE, ABSORBED_SLOWNESS = 0.02, 0.5
+"""Offsets with an SD below this share of the other errors' are not believed along a path with at
+least this slowness (:func:`jaxcal.calibration.serial_correlation.slowness`)."""
 
 MOST_IMAGES = 20
 """So many images of a second target or origin are named; the JSON has all."""
@@ -78,6 +84,7 @@ def contradictions(record: dict[str, Any]) -> list[tuple[float, str]]:
         _from_slow_changes,
         _from_unmodelled,
         _from_groups,
+        _from_absorbed_offsets,
         _from_left_out,
         _from_limits,
     )
@@ -313,6 +320,23 @@ def _from_left_out(record: dict[str, Any]) -> list[tuple[float, str]]:
         f"{found['apart_mm']:.1f} mm away: which of the two is right?"
     )
     return [(math.hypot(1.0, found["apart_mm"] / stated), words)]
+
+
+def _from_absorbed_offsets(record: dict[str, Any]) -> list[tuple[float, str]]:
+    """Offsets that the answer has taken up: as large as the other errors, as far as one knows."""
+    slow, offsets = record["tre"]["slow_path"], record["sigma_elevation_mm"]
+    others = [size for kind in ("lateral", "range") if (size := record[f"sigma_{kind}_mm"])]
+    if slow < ABSORBED_SLOWNESS or not (offsets and len(others) == 2):
+        return []
+    if offsets >= ABSORBED_SHARE * min(others):
+        return []
+    words = (
+        f"offsets from the image plane with an SD of {offsets:.1g} mm, where other errors have "
+        f"{min(others):.2f} mm, are too small to be true: the images lie along one slow path, and "
+        "the calibration has taken up the offsets that changed as slowly (take images in other "
+        "poses, in a random order)"
+    )
+    return [(min(others) / offsets, words)]
 
 
 def _from_limits(record: dict[str, Any]) -> list[tuple[float, str]]:
