@@ -42,9 +42,10 @@ Gaussian offsets than so many times the error of that fit."""
 SCATTER_TIMES = 1.3
 """Resampled calibrations may scatter by up to so many times the stated error."""
 
-ABSORBED_SHARE, ABSORBED_SLOWNESS = 0.02, 0.5
-"""Offsets with an SD below this share of the other errors' are not believed along a path with at
-least this slowness (:func:`jaxcal.calibration.serial_correlation.slowness`)."""
+SLOW = 0.5
+"""Least slowness of a slow path (:func:`jaxcal.calibration.serial_correlation.slowness`)."""
+ABSORBED_SHARE = 0.02
+"""Along a slow path offsets with an SD below this share of the other errors' are not believed."""
 
 MOST_IMAGES = 20
 """So many images of a second target or origin are named; the JSON has all."""
@@ -326,7 +327,7 @@ def _from_absorbed_offsets(record: dict[str, Any]) -> list[tuple[float, str]]:
     """Offsets that the answer has taken up: as large as the other errors, as far as one knows."""
     slow, offsets = record["tre"]["slow_path"], record["sigma_elevation_mm"]
     others = [size for kind in ("lateral", "range") if (size := record[f"sigma_{kind}_mm"])]
-    if slow < ABSORBED_SLOWNESS or not (offsets and len(others) == 2):
+    if slow < SLOW or not (offsets and len(others) == 2):
         return []
     if offsets >= ABSORBED_SHARE * min(others):
         return []

@@ -10,7 +10,7 @@ import math
 from typing import Any
 
 from jaxcal.diagnostics.warnings import WEAK_MM, rests_on
-from jaxcal.report.contradictions import MOST_IMAGES
+from jaxcal.report.contradictions import MOST_IMAGES, SLOW
 from jaxcal.report.paragraphs import listed
 from jaxcal.report.resampled import resampled_sentences
 from jaxcal.result.saved import ASKED_FOR
@@ -217,6 +217,12 @@ def limits(record: dict[str, Any]) -> list[str]:
     poses = _poses(record)
     if poses:
         lines.append(poses)
+    if tre["slow_path"] >= SLOW:
+        lines.append(
+            "The images lie along one slow path. Errors that change as slowly look like a movement "
+            "of the calibration, and the stated error allows for it; images in a random order of "
+            "poses would make it smaller."
+        )
     influence = record.get("influence")
     if influence is not None:
         strong = [
