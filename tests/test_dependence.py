@@ -252,6 +252,15 @@ def test_a_smooth_sweep_is_seldom_good_and_wrong(frames, count, step_s, most):
     assert sum(_good_and_wrong(one)[1] for one in made) <= most
 
 
+def test_unknowns_that_a_short_path_hardly_tells_apart_are_no_error(frames):
+    """The Cholesky factor of their covariance did not exist."""
+    for seed in (13, 16, 26):
+        made = frames.smooth(20, 0.1, np.random.default_rng([5, seed]))
+        result = jaxcal.calibrate(jaxcal.Problem.from_arrays(made.poses, made.points))
+        assert not _good_and_wrong(made)[1]
+        assert result.verdict()
+
+
 def test_a_slow_path_is_believed_where_offsets_were_drawn_anew(frames):
     made = [frames.smooth(30, 0.5, np.random.default_rng([4, k]), anew=True) for k in range(8)]
     good, wrong = np.sum([_good_and_wrong(one) for one in made], axis=0)

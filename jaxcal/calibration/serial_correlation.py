@@ -299,6 +299,10 @@ def _restricted_cost(joint: Float[np.ndarray, "g q q"]) -> Float[np.ndarray, " g
 
 def _lower(covariance: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
     """The Cholesky factor of a covariance that may be singular to rounding."""
+    try:
+        return np.linalg.cholesky(covariance)
+    except np.linalg.LinAlgError:
+        pass
     size = np.sqrt(np.diagonal(covariance))
     values, vectors = np.linalg.eigh(covariance / np.outer(size, size))
     least = 4 * len(size) * np.finfo(float).eps
