@@ -56,7 +56,7 @@ SLOW_SHARE, RANDOM_SHARE = 0.2, 0.4
 """Steps between images, as shares of the distance of poses half a recording apart: up to the first
 one a path is slow, and from the second one on poses change at random."""
 
-TIMES, SHORTEST_TIME, LONGEST_TIMES = 10, 1.15, 8.0
+TIMES, SHORTEST_TIME, LONGEST_TIMES = 10, 1.15, 4.0
 """Number of autocorrelation times that are weighed along a slow path, the shortest one in images,
 and the longest one in numbers of all images."""
 
