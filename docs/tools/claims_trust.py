@@ -152,6 +152,8 @@ SWEEPS = (
     "sweep 30 s, alike for 1 s",
     "sweep 60 s, alike for 1 s",
 )
+SMOOTH = ("12, 0.5", "20, 0.5", "30, 0.5", "100, 0.05")
+"""Number of images of smooth sweeps, and seconds between them."""
 PATHS = tuple(
     f"path of {count}, correlation {share:g}" for count in (40, 100) for share in (0, 0.3, 0.6)
 )
@@ -210,6 +212,48 @@ def _good() -> list[float]:
 
 
 claim(ACCURACY, "and in {:.1f} to {:.1f} % of the sweeps.", _good)
+
+
+def _smooth(*counts: str) -> tuple[str, ...]:
+    return tuple(f"smooth sweep of {count} s apart" for count in counts)
+
+
+claim(
+    ACCURACY,
+    "The intervals of `calibrate` contain the truth in {:.1f} to {:.1f} % only; if every frame "
+    "counted as an image, in {:.1f} to {:.1f} %.",
+    lambda: percent(
+        [
+            *span(_frames("cover_95_mean", "calibrate", _smooth(*SMOOTH))),
+            *span(_frames("cover_95_mean", "every frame", _smooth(*SMOOTH))),
+        ]
+    ),
+)
+claim(
+    ACCURACY,
+    "By the stated error {:.1f} to {:.1f} % of the sweeps with 20 and 30 images would be good "
+    "although the truth is outside a 99 % interval, where it would be {:.1f} to {:.1f} %.",
+    lambda: percent(
+        [
+            *span(_frames("good_outside_99", "calibrate", _smooth(*SMOOTH[1:3]))),
+            *span(_frames("good_outside_99", "every frame", _smooth(*SMOOTH[1:3]))),
+        ]
+    ),
+)
+claim(
+    ACCURACY,
+    "Where the offsets are drawn anew for every image of such a path, the intervals contain the "
+    "truth in {:.1f} to {:.1f} %.",
+    lambda: percent(
+        span(
+            _frames(
+                "cover_95_mean",
+                "calibrate",
+                tuple(f"sweep of {count}, 0.5 s apart, offsets anew" for count in (12, 20, 30)),
+            )
+        )
+    ),
+)
 KEPT, ONE_OF_A_TIME = "2.5, at least 60", "1 of a time"
 
 

@@ -373,7 +373,7 @@ def _print(
         table.add_row(
             str(found.known.images + k + 1),
             pose["words"] + sign,
-            f"{lateral:.0f}, {depth:.0f}",
+            f"{lateral:z.0f}, {depth:z.0f}",
             f"{pose['tre_mm']:#.3g}",
         )
     there = found.known.images
@@ -395,7 +395,7 @@ def _print(
     these = "this image" if len(found) == 1 else f"these {len(found)} images"
     print_page(
         table,
-        f"Target {near:.0f} to {far:.0f} mm {extent} from {left:.0f} to {right:.0f} mm.",
+        f"Target {near:.0f} to {far:.0f} mm {extent} from {left:z.0f} to {right:z.0f} mm.",
         "Tilts and turns from the middle orientation, with the marker to your right; left is where "
         "the lateral position is smallest. Take them in any order.",
         *reached,

@@ -50,6 +50,8 @@ ABSORBED_SHARE = 0.02
 MOST_IMAGES = 20
 """So many images of a second target or origin are named; the JSON has all."""
 
+_WORTH_NAMING = 0.1
+"""A length is not named if it is wrong by less than this share of what another one is wrong by."""
 _WAYS = {"lateral": "sideways", "range": "in depth"}
 """Errors within the image, in the order of the residuals, and in words."""
 
@@ -203,9 +205,11 @@ def _explanation(found: dict[str, Any], *, pixels: bool) -> tuple[str, str]:
     those = f"images {', '.join([*map(str, images[:MOST_IMAGES]), *more])} (counted from 0)"
     match found["kind"]:
         case "scale":
+            least = _WORTH_NAMING * max(map(abs, values))
+            lengths = ("lateral positions", values[0]), ("ranges", values[1])
+            told = [f"{what} that are {_too_long(by)}" for what, by in lengths if abs(by) >= least]
             return (
-                f"lateral positions that are {_too_long(values[0])} and ranges that are "
-                f"{_too_long(values[1])}",
+                " and ".join(told),
                 "check pixel size, sound speed and the tracker's unit, or estimate the scale"
                 if pixels
                 else "check what gave the points their mm (pixel size, sound speed, pitch of the "

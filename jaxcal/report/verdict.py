@@ -295,14 +295,13 @@ def believe(record: dict[str, Any]) -> list[str]:
     beside = record.get("comparison")
     if beside is None:
         return []
-    larger = (beside["rms_mm"] or 0.0) > beside["conventional_rms_mm"]
+    rms, conventional = beside["rms_mm"], beside["conventional_rms_mm"]
+    shown, other = _fine(rms), _fine(conventional)
     first = (
-        f"Its RMS residual is larger than that of the conventional fit ({_fine(beside['rms_mm'])} "
-        f"against {_fine(beside['conventional_rms_mm'])} mm), as it must be: the conventional fit "
-        "minimises exactly this."
-        if larger
-        else f"Its RMS residual is that of the conventional fit ({_fine(beside['rms_mm'])} against "
-        f"{_fine(beside['conventional_rms_mm'])} mm)."
+        f"Its RMS residual is larger than that of the conventional fit ({shown} against {other} "
+        "mm), as it must be: the conventional fit minimises exactly this."
+        if (rms or 0.0) > conventional and shown != other
+        else f"Its RMS residual is that of the conventional fit ({shown} against {other} mm)."
     )
     lines = [first]
     if beside["conventional_tre_mm"] is not None and beside["tre_mm"] is not None:
