@@ -73,7 +73,7 @@ LEAST_STREAM_TIME = 4.0
 KEPT_OF_TIME, KEPT_OF_STREAM = 2.5, 60
 """Least number of images that are kept of an autocorrelation time, and of a whole stream. With
 fewer images errors are larger, and intervals do not hold more often; with all images of a stream
-intervals are too short (``experiments/stream_images.py``)."""
+errors are not smaller (``experiments/stream_images.py``)."""
 
 STREAM_SCORE = 5.0
 """In a stream the correlation of successive errors is more than so many SDs above zero."""
