@@ -181,6 +181,22 @@ def test_residuals_of_test_images_make_up_the_precision(tmp_path, result, record
     assert "target in tracker frame (mm)" in dict(frames_and_target(record))
 
 
+def test_a_few_test_images_that_do_not_fit_are_named(result, recording, record):
+    """They condemned the calibration, unnamed; many of them still do."""
+    wrong = {}
+    for count in (3, 8):
+        test = recording.test
+        points = test.measurements.copy()
+        points[2 : 2 + count, 0] += 15.0 * (-1.0) ** np.arange(count)
+        tested = dataclasses.replace(test, measurements=points)
+        wrong[count] = calibration_record(result, dataclasses.replace(recording, test=tested))
+    told = "Test images 2, 3, 4 (counted from 0) do not fit the others"
+    assert told in " ".join(verdict(wrong[3]))
+    assert wrong[3]["tre"]["rms_mm"] == record["tre"]["rms_mm"]
+    assert "do not fit the others" not in " ".join(verdict(wrong[8]))
+    assert wrong[8]["tre"]["rms_mm"] > 2 * record["tre"]["rms_mm"]
+
+
 def test_pixel_test_images_are_brought_to_mm(result, recording, record):
     other = Recording(pixels(recording.test, (0.1, 0.2), 3.0))
     converted = calibration_record(result, recording, other)

@@ -8,7 +8,8 @@ The covariance assumes that the noise model holds. It is contradicted if
   times the expected move (by one step from the normal equations, or by cross-validation if this was
   requested);
 - the scatter in cross-validation or bootstrap is more than 1.3 times the stated error;
-- test images scatter far more than the calibration explains;
+- test images scatter far more than the calibration explains, also without a few of them that do not
+  fit the others;
 - the errors within the image drift, come in two groups, or would be explained by an error that the
   model leaves out (:mod:`jaxcal.diagnostics.unmodelled`);
 - along a slow path the offsets are far smaller than all other errors: those that changed as slowly
@@ -36,6 +37,8 @@ share of the error, and by more than so many times the expected move."""
 TEST_TIMES = 3.0
 """Test images contradict the stated error if they scatter by more than so many times what the
 calibration's own errors and uncertainty explain."""
+OUTLYING_TESTS = 0.25
+"""Up to this share of the test images may not fit the others and is named instead."""
 LIMITS_TIMES = 1.25
 """Bounded or uniform offsets contradict the stated error if the answer is farther from the fit with
 Gaussian offsets than so many times the error of that fit."""
@@ -145,16 +148,37 @@ def _from_test_images(record: dict[str, Any]) -> list[tuple[float, str]]:
     found, stated = record["reconstruction_precision_mm"], record["tre"]["stated_mm"]
     if record["reconstruction_precision_set"] != "test" or found is None or not stated:
         return []
-    errors = [_sd(record, kind) or 0.0 for kind in (*_WAYS, "elevation")]
-    # Poses that turn the image see its error twice as large.
-    expected = math.hypot(*errors, 2 * stated)
-    if found <= TEST_TIMES * expected:
+    errors, expected = _of_test_images(record)
+    if found <= TEST_TIMES * expected or outlying_test_images(record):
         return []
     words = (
         f"the test images scatter by {found:.2f} mm, where {expected:.2f} mm is expected (is it "
         "the same probe, depth and mount?)"
     )
-    return [(math.sqrt(found**2 - math.hypot(*errors) ** 2) / stated, words)]
+    return [(math.sqrt(found**2 - errors**2) / stated, words)]
+
+
+def _of_test_images(record: dict[str, Any]) -> tuple[float, float]:
+    """Errors of single images, and the scatter of test images to expect with it, mm."""
+    errors = math.hypot(*(_sd(record, kind) or 0.0 for kind in (*_WAYS, "elevation")))
+    # Poses that turn the image see its error twice as large.
+    return errors, math.hypot(errors, 2 * record["tre"]["stated_mm"])
+
+
+def outlying_test_images(record: dict[str, Any]) -> list[int]:
+    """Test images, counted from 0, without which the others scatter as they may; else none.
+
+    They may be a quarter of all at most: wrong clicks, say.
+    """
+    rows, tre = record.get("test_residual_mm"), record["tre"]
+    if not rows or tre is None or not tre["stated_mm"]:
+        return []
+    limit = TEST_TIMES * _of_test_images(record)[1]
+    away = {k: math.hypot(*row) for k, row in enumerate(rows) if row is not None}
+    outlying = [k for k, distance in away.items() if distance > limit]
+    rest = [distance for distance in away.values() if distance <= limit]
+    few = 0 < len(outlying) <= OUTLYING_TESTS * len(away)
+    return outlying if few and math.hypot(*rest) <= limit * math.sqrt(len(rest) - 1) else []
 
 
 def _from_slow_changes(record: dict[str, Any]) -> list[tuple[float, str]]:

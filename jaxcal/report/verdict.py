@@ -10,7 +10,7 @@ import math
 from typing import Any
 
 from jaxcal.diagnostics.warnings import WEAK_MM, rests_on
-from jaxcal.report.contradictions import MOST_IMAGES, SLOW
+from jaxcal.report.contradictions import MOST_IMAGES, SLOW, outlying_test_images
 from jaxcal.report.paragraphs import listed
 from jaxcal.report.resampled import resampled_sentences
 from jaxcal.result.saved import ASKED_FOR
@@ -269,10 +269,19 @@ def scatter(record: dict[str, Any]) -> list[str]:
             "The images agree with each other better than they determine the calibration: add "
             "other poses."
         )
-    return [
+    lines = [
         f"With this calibration, the images put the target {_mm(record['rms_mm'])} from its "
         f"estimated place (RMS{shown}). Shares of the mean square: {', '.join(told)}. {means}"
     ]
+    outlying = outlying_test_images(record)
+    if outlying:
+        named = ", ".join(map(str, outlying[:MOST_IMAGES]))
+        more = ", ..." if len(outlying) > MOST_IMAGES else ""
+        lines.append(
+            f"Test images {named}{more} (counted from 0) do not fit the others, which scatter as "
+            "expected: check their points. They are not held against this calibration."
+        )
+    return lines
 
 
 def _poses(record: dict[str, Any]) -> str | None:
