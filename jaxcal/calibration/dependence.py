@@ -426,7 +426,11 @@ def _moves_continuously(poses: Float[np.ndarray, "n 4 4"]) -> bool:
 
 
 def step_share(poses: Float[np.ndarray, "n 4 4"]) -> float:
-    """The step from image to image over the distance of poses half a recording apart; medians."""
+    """The median step from image to image over the median distance half a recording apart.
+
+    Args:
+        poses: of successive images, probe -> tracker, mm.
+    """
     steps = displacement(poses[1:], poses[:-1])
     apart = displacement(poses, np.roll(poses, len(poses) // 2, axis=0))
     return float(np.median(steps) / max(np.median(apart), 1e-300))

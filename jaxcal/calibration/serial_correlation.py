@@ -140,7 +140,14 @@ def _wider_medium(
 
 
 def slowness(poses: Float[np.ndarray, "n 4 4"]) -> float:
-    """1 along a slow path, 0 where poses change at random, by the size of the steps."""
+    """How slow a path is, by the size of its steps: 1 for a slow path, 0 for poses at random.
+
+    It falls linearly between :data:`SLOW_SHARE` and :data:`RANDOM_SHARE`, and is 0 for fewer than
+    :data:`FEWEST_SLOW` images.
+
+    Args:
+        poses: of the images in use, in the order in which they were taken, probe -> tracker, mm.
+    """
     if len(poses) < FEWEST_SLOW:
         return 0.0
     return float(np.interp(step_share(poses), [SLOW_SHARE, RANDOM_SHARE], [1.0, 0.0]))

@@ -130,7 +130,11 @@ def rms_from_mean(
     image_points: Float[AnyArray, "m 2"],
     weight: Float[AnyArray, " k"],
 ) -> Float[AnyArray, " m"]:
-    """Root mean square of these distances, which a covariance states as well."""
+    """Root mean square distance of image points from their weighted mean, mm.
+
+    Unlike the mean distance it compares with what a covariance states. NaN where all weights are
+    zero.
+    """
     apart, share = _from_mean(transforms, image_points, weight)
     xp = array_module(apart)
     return xp.sqrt(xp.sum(share * apart**2, axis=0))
