@@ -483,6 +483,11 @@ def with_nan(values):
         ("velocity", lambda _: np.full((COUNT, 6), np.inf), "velocity 0 holds a number beyond"),
         ("amplitude", lambda _: np.ones(COUNT + 1), r"amplitude must have shape \(6,\)"),
         ("covariance", lambda _: np.zeros((COUNT, 2, 2)), "covariance 0 is not symmetric"),
+        (
+            "covariance",
+            lambda _: np.full((COUNT, 2, 2), 1e-30) * np.eye(2),
+            "covariance 0 has an SD below",
+        ),
     ],
 )
 def test_unusable_values(path, name, change, message):

@@ -133,9 +133,10 @@ def test_npz_keeps_what_the_uncertainty_needs(tmp_path):
     """Estimated pixel sizes and sound speed included; older files have fewer names."""
     unknowns = ("translation", "rotation", "scale", "sound-speed")
     root = np.random.default_rng(1).normal(size=(9, 9)) * [*[0.2] * 3, *[0.01] * 3, *[0.004] * 3]
+    covariance = root.T @ root
     known = replace(
-        random_transform(), unknowns=unknowns, image_covariance=root.T @ root, range_factor=0.99,
-        probe_frame="Stylus",
+        random_transform(), unknowns=unknowns, covariance=covariance[:6, :6],
+        image_covariance=covariance, range_factor=0.99, probe_frame="Stylus",
     )  # fmt: skip
     for name in ("cal.npz", "cal.json"):
         known.save(tmp_path / name)
@@ -604,6 +605,10 @@ def good_record():
         ({"face_offset_mm": None}, "plus_image_to_probe contradicts"),
         ({"plus_image_to_probe": "x"}, "must be numbers"),
         ({"covariance": [[1]]}, r"must have shape \(6, 6\)"),
+        (
+            {"covariance": np.eye(6).tolist(), "image_covariance": (4 * np.eye(6)).tolist()},
+            "image_covariance contradicts covariance",
+        ),
     ],
 )
 def test_json_that_lies(tmp_path, change, message):

@@ -521,3 +521,28 @@ def test_images_left_out_that_agree_among_themselves_are_told_of():
     wild = with_points(recording, points)
     result = jaxcal.calibrate(wild, prior="gaussian", robust=True)
     assert calibration_record(result, wild)["tre"]["left_out"] is None
+
+
+@pytest.mark.parametrize("whole_pixels", [False, True])
+def test_points_cut_off_at_a_depth_are_told_of(whole_pixels):
+    found = clean(3)
+    points = found.calibration.measurements.copy()
+    if whole_pixels:
+        points = np.round(points)
+    assert calibration(with_points(found, points))["tre"]["clipped"] is None
+    limit = np.sort(points[:, 1])[-9]
+    deep = np.flatnonzero(points[:, 1] >= limit)
+    points[:, 1] = np.minimum(points[:, 1], limit)
+    record = calibration(with_points(found, points))
+    edge = record["tre"]["clipped"]
+    assert (edge["axis"], edge["largest"], edge["value"]) == (1, True, limit)
+    assert edge["images"] == deep.tolist()
+    assert record["verdict"] != "good"
+    told = f"{len(deep)} images share the largest range, {limit:.6g} mm"
+    assert any(told in words for words in record["tre"]["contradictions"])
+    # The images that are named hold what was wrong.
+    assert edge["apart_mm"] > 0.5 * record["tre"]["stated_mm"]
+
+
+def calibration(recording: Recording) -> dict:
+    return calibration_record(jaxcal.calibrate(recording), recording)

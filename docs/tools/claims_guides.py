@@ -70,7 +70,7 @@ claim(
 # A mean of the offsets.
 def _off_centre(row: Row) -> list[float]:
     """Coverage with each mean, %."""
-    where = {name: row[name] for name in ("images", "noise_mm")}
+    where = {name: row[name] for name in ("sd_mm", "images", "noise_mm")}
     return percent(column("off_centre", "cover_t_elevational", **where))
 
 
@@ -88,7 +88,8 @@ for centred in table("off_centre"):
     if number(centred, "mean_mm") == 0:
         claim(
             TRUST,
-            f"| {number(centred, 'range_sd_mm'):.2f} mm | {centred['images']} "
+            f"| {centred['sd_mm']} mm | {number(centred, 'range_sd_mm'):.2f} mm "
+            f"| {centred['images']} "
             "| {:.0f} | {:.0f} | {:.0f} | {:.0f} | {:.0f} | {:.0f} |",
             lambda row=centred: _off_centre(row),
         )

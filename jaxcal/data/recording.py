@@ -36,6 +36,9 @@ MOST_IMAGES = 100_000
 LARGEST = 1e7
 """Largest coordinate accepted, in mm or px, and largest variance of one: ten kilometres."""
 
+LEAST_SD = 1e-9
+"""Least SD accepted in a covariance, in mm or px: no point is known within a picometre."""
+
 LARGEST_FRAME = 2**53
 """Largest number of a frame; larger ones are not exact in float64."""
 
@@ -646,8 +649,9 @@ def checked_covariance(
     scale = np.abs(values).max(axis=(1, 2))
     bad = np.abs(values[:, 0, 1] - values[:, 1, 0]) > 1e-6 * scale
     symmetric = (values + values.swapaxes(1, 2)) / 2
-    bad |= np.linalg.eigvalsh(symmetric)[:, 0] <= 1e-12 * scale
-    _refuse("covariance", bad, "is not symmetric and positive definite")
+    least = np.linalg.eigvalsh(symmetric)[:, 0]
+    _refuse("covariance", bad | (least <= 1e-12 * scale), "is not symmetric and positive definite")
+    _refuse("covariance", least < LEAST_SD**2, f"has an SD below {LEAST_SD:g}: is its unit right?")
     return symmetric
 
 

@@ -9,6 +9,7 @@
     unmodelled       errors that the model leaves out and that the residuals show
     tracker_distortion   one of these: tracked positions that are off, smoothly in space
     second_target    another one: images of two targets, or with two origins
+    clipped          points that were cut off at the edge of a region
     change_point     where something has changed at once
     serial_errors    errors that are alike in successive images
     channel_points   what the elements' times of flight say of their images' points

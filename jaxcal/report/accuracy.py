@@ -24,6 +24,7 @@ from jaxcal.data.poses import targets_in_images
 from jaxcal.data.recording import LARGEST, Recording
 from jaxcal.design.candidates import seen_region
 from jaxcal.design.constraints import Region
+from jaxcal.diagnostics.clipped import clipped
 from jaxcal.diagnostics.gaussian_offsets import away_from_gaussian
 from jaxcal.diagnostics.image_errors import KINDS, ImageErrors, noise_covariance
 from jaxcal.diagnostics.influence import Influence, conventional_fit, excess, in_image, influence_of
@@ -77,6 +78,8 @@ def accuracy_record(
     tre["gaussian_offsets"] = away and dict(zip(("apart_mm", "error_mm"), away, strict=True))
     tre["slow_path"] = slowness(recording.calibration.poses[np.asarray(answer.mask) > 0])
     agreeing = agreeing_outliers(answer, float(tre["stated_mm"]), grid)
+    edge = clipped(answer, grid)
+    tre["clipped"] = edge and vars(edge)
     tre["left_out"] = agreeing and dict(zip(("images", "apart_mm"), agreeing, strict=True))
     return {
         "tre": tre,

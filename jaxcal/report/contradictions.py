@@ -14,6 +14,8 @@ The covariance assumes that the noise model holds. It is contradicted if
   model leaves out (:mod:`jaxcal.diagnostics.unmodelled`);
 - along a slow path the offsets are far smaller than all other errors: those that changed as slowly
   as the pose have moved the answer instead;
+- many points share the outermost coordinate, as if cut off there
+  (:mod:`jaxcal.diagnostics.clipped`);
 - images that were left out as outliers agree among themselves on another calibration
   (:mod:`jaxcal.diagnostics.outlier_agreement`);
 - offsets are bounded or uniform, and the fit with Gaussian offsets is far away
@@ -23,6 +25,7 @@ The covariance assumes that the noise model holds. It is contradicted if
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 from jaxcal.diagnostics.misfits import DRIFT_SCORE, in_two_groups
@@ -91,6 +94,7 @@ def contradictions(record: dict[str, Any]) -> list[tuple[float, str]]:
         _from_unmodelled,
         _from_groups,
         _from_absorbed_offsets,
+        _from_clipped,
         _from_left_out,
         _from_limits,
     )
@@ -224,9 +228,8 @@ def _explanation(found: dict[str, Any], *, pixels: bool) -> tuple[str, str]:
         found: the error that the model leaves out, as in the record.
         pixels: whether the calibration has pixels.
     """
-    values, images = found["values"], found["images"] or ()
-    more = ["..."] if len(images) > MOST_IMAGES else []
-    those = f"images {', '.join([*map(str, images[:MOST_IMAGES]), *more])} (counted from 0)"
+    values = found["values"]
+    those = f"images {images_named(found['images'] or ())}"
     match found["kind"]:
         case "scale":
             least = _WORTH_NAMING * max(map(abs, values))
@@ -326,6 +329,12 @@ def _explanation(found: dict[str, Any], *, pixels: bool) -> tuple[str, str]:
             raise AssertionError(kind)
 
 
+def images_named(images: Sequence[int]) -> str:
+    """Their numbers; of many images those of the first ones."""
+    more = ["..."] if len(images) > MOST_IMAGES else []
+    return f"{', '.join([*map(str, images[:MOST_IMAGES]), *more])} (counted from 0)"
+
+
 def _from_groups(record: dict[str, Any]) -> list[tuple[float, str]]:
     """Errors within the image that come in two groups."""
     stated, model = record["tre"]["stated_mm"], record["noise_model"]
@@ -366,6 +375,22 @@ def _from_absorbed_offsets(record: dict[str, Any]) -> list[tuple[float, str]]:
         "poses, in a random order)"
     )
     return [(min(others) / offsets, words)]
+
+
+def _from_clipped(record: dict[str, Any]) -> list[tuple[float, str]]:
+    """Points that were cut off at an edge, beyond which the target was in some images."""
+    found, stated = record["tre"]["clipped"], record["tre"]["stated_mm"]
+    if found is None or not stated:
+        return []
+    pixels = record["tre"]["unit"] == "px"
+    name = (("u", "v") if pixels else ("lateral position", "range"))[found["axis"]]
+    end, beyond = ("largest", "larger") if found["largest"] else ("smallest", "smaller")
+    words = (
+        f"{len(found['images'])} images share the {end} {name}, {found['value']:.6g} "
+        f"{record['tre']['unit']}: were {beyond} ones cut off (by a region of interest, or the "
+        f"edge of the image)? Calibrate without images {images_named(found['images'])}"
+    )
+    return [(math.hypot(1.0, (found["apart_mm"] or 0.0) / stated), words)]
 
 
 def _from_limits(record: dict[str, Any]) -> list[tuple[float, str]]:

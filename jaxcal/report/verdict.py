@@ -10,7 +10,7 @@ import math
 from typing import Any
 
 from jaxcal.diagnostics.warnings import WEAK_MM, rests_on
-from jaxcal.report.contradictions import MOST_IMAGES, SLOW, outlying_test_images
+from jaxcal.report.contradictions import MOST_IMAGES, SLOW, images_named, outlying_test_images
 from jaxcal.report.paragraphs import listed
 from jaxcal.report.resampled import resampled_sentences
 from jaxcal.result.saved import ASKED_FOR
@@ -67,7 +67,9 @@ def frames_of_images(record: dict[str, Any]) -> list[str]:
     influence = record.get("influence") or {"most": []}
     suspected = (each["image"] for each in record["suspects"])
     second = _unmodelled(record).get("images") or []
-    named = {*record["outliers"], *suspected, *influence["most"][:3], *second[:MOST_IMAGES]}
+    clipped = ((record.get("tre") or {}).get("clipped") or {}).get("images", [])
+    listed = *second[:MOST_IMAGES], *clipped[:MOST_IMAGES]
+    named = {*record["outliers"], *suspected, *influence["most"][:3], *listed}
     told = [] if frame is None else [(k, frame[k]) for k in sorted(named) if frame[k] != k]
     if not told:
         return []
@@ -275,10 +277,8 @@ def scatter(record: dict[str, Any]) -> list[str]:
     ]
     outlying = outlying_test_images(record)
     if outlying:
-        named = ", ".join(map(str, outlying[:MOST_IMAGES]))
-        more = ", ..." if len(outlying) > MOST_IMAGES else ""
         lines.append(
-            f"Test images {named}{more} (counted from 0) do not fit the others, which scatter as "
+            f"Test images {images_named(outlying)} do not fit the others, which scatter as "
             "expected: check their points. They are not held against this calibration."
         )
     return lines

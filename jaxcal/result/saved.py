@@ -461,6 +461,13 @@ def transform_from_record(record: dict[str, Any], *, source: str = "memory") -> 
         date=date,
         **{name: value for name, value in given.items() if value is not None},
     )
+    whole, part = given["image_covariance"], given["covariance"]
+    if not (whole is None or part is None):
+        sds = np.sqrt(np.diag(part))
+        if not (np.abs(whole[:6, :6] - part) <= _ROUNDED * np.outer(sds, sds)).all():
+            raise FormatError(
+                "image_covariance contradicts covariance: one of them was changed alone"
+            )
     stated = _array(record, "plus_image_to_probe", (4, 4)) if found.converged is not False else None
     if stated is not None and not _agrees(found, stated):
         raise FormatError(
