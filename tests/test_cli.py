@@ -30,6 +30,7 @@ from jaxcal import design
 from jaxcal.cli import common, demo, plan
 from jaxcal.cli.main import commands, main
 from jaxcal.cli.run import run
+from jaxcal.data.probe import PRESETS
 from jaxcal.data.recording import Recording, make_images
 from jaxcal.design.constraints import Region
 from jaxcal.io.atomic import save_figure
@@ -879,6 +880,13 @@ def test_the_region_of_pixels_is_about_the_middle_of_the_image(tmp_path, capfd):
     jaxcal.save(Recording(replace(images, spacing_mm=np.full(2, 0.1))), tmp_path / "pixels.h5")
     said = refused(capfd, "plan", tmp_path / "pixels.h5", "--probe", "linear")
     assert "where the transducer is in the image is not known" in said
+
+
+@pytest.mark.usefixtures("calibrated")
+def test_a_plan_refuses_another_probe_than_the_recordings(simulated, tmp_path, capfd):
+    jaxcal.save(replace(jaxcal.load(simulated), probe=PRESETS["linear"]), tmp_path / "linear.h5")
+    said = refused(capfd, "plan", tmp_path / "linear.h5", "--probe", "curvilinear")
+    assert "holds images of another probe" in said
 
 
 @pytest.mark.usefixtures("calibrated")

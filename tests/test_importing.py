@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 import jaxcal
 from jaxcal import FormatError, InputError
 from jaxcal.cli.main import main
-from jaxcal.data.recording import joined
+from jaxcal.data.recording import Recording, joined
 from jaxcal.io import slicer
 from jaxcal.io.columns import columns_of_header
 from jaxcal.io.importing.files import import_files
@@ -98,6 +98,7 @@ def test_headers_are_read(tmp_path, lines):
 def test_times_of_every_kind(tmp_path):
     for name, stamps, expected in (
         ("time [ms]", [0.5, 1, 2, 4, 8, 9], np.array([0.5, 1, 2, 4, 8, 9]) / 1e3),
+        ("seconds", [0.5, 1, 2, 4, 8, 9], np.array([0.5, 1, 2, 4, 8, 9])),
         ("stamp_ns", [10**18 + 10**9 * k for k in range(6)], 1e9 + np.arange(6)),
         ("Timestamp", [f"2026-11-21T21:00:0{k}.5" for k in range(6)], np.arange(6.0)),
     ):
@@ -124,6 +125,18 @@ def test_quaternion_order_is_asked_for(tmp_path):
         other = import_files([tmp_path / "t.csv"], ImportOptions(quaternion="wxyz"))[0].calibration
         expected = Rotation.from_quat(QUATERNIONS[:, [1, 2, 3, 0]]).as_matrix()
         np.testing.assert_allclose(other.poses[:, :3, :3], expected, atol=1e-12)
+
+
+def test_the_numbers_of_quaternions_columns_count_and_not_their_order(tmp_path):
+    mixed = table([*NAMES[:5], "q1", "q2", "q3", "q0"], COLUMNS)
+    (tmp_path / "t.csv").write_text("\n".join(mixed))
+    found = import_files([tmp_path / "t.csv"], ImportOptions(quaternion="wxyz"))[0].calibration
+    np.testing.assert_allclose(found.poses, POSES, atol=1e-11)
+    for numbers in ("1111", "0114", "0124"):
+        named = table([*NAMES[:5], *(f"q{number}" for number in numbers)], COLUMNS)
+        (tmp_path / "t.csv").write_text("\n".join(named))
+        with pytest.raises(FormatError, match="must be numbered q0 to q3, or q1 to q4"):
+            import_files([tmp_path / "t.csv"], ImportOptions(quaternion="wxyz"))
 
 
 def test_an_order_that_contradicts_the_header_is_refused(tmp_path):
@@ -1069,6 +1082,10 @@ def test_images_are_added_to_a_recording(tmp_path, capsys):
     both, whole = jaxcal.load(out).calibration, jaxcal.load(tmp_path / "all.h5").calibration
     np.testing.assert_allclose(both.poses, whole.poses, atol=1e-12)
     np.testing.assert_array_equal(both.measurements, whole.measurements)
+    # Numbers of frames would be those of two files.
+    numbered = replace(jaxcal.load(first).calibration, frame=np.arange(4))
+    more_numbered = replace(whole, frame=np.arange(6))
+    assert joined(Recording(numbered), Recording(more_numbered)).calibration.frame is None
     assert main(["import", second, out, "--add-to", first]) == 0
     assert len(jaxcal.load(out)) == 8
 

@@ -28,7 +28,7 @@ from jaxcal.io.dicom import read_pixel_size
 from jaxcal.io.folder import read_folder
 from jaxcal.io.importing.files import import_files
 from jaxcal.io.importing.frame_poses import open_sequence
-from jaxcal.io.importing.poses_by_time import with_poses_by_time
+from jaxcal.io.importing.poses_by_time import PoseTrack, with_poses_by_time
 from jaxcal.io.importing.sources import ImportOptions
 from jaxcal.io.picker.picks import Picks
 from jaxcal.io.png import encode_png, png_size, read_png
@@ -135,7 +135,7 @@ def test_segment_a_sequence(tmp_path, sequence, capsys):
     scaled = np.einsum("ni,nij,nj->n", error, np.linalg.inv(images.covariance), error)
     assert scaled.mean() < 6
     with h5py.File(tmp_path / "f-segmented.h5") as file:
-        np.testing.assert_array_equal(file["segmentation/frame"], FOUND)
+        np.testing.assert_array_equal(file["segmentation/row"], FOUND)
         fates = file["segmentation"].attrs["fates"].split(", ")
         told = [fates[fate] for fate in file["segmentation/fate"]]
     assert [told[k] for k in (NOT_TRACKED, HIDDEN, BLANK)] == [
@@ -352,6 +352,31 @@ def test_a_folder_and_points(tmp_path, folder, column):
     np.testing.assert_allclose(recording.calibration.measurements, POINTS[used])
     np.testing.assert_allclose(recording.calibration.poses, POSES[used], atol=1e-9)
     assert frames is None
+
+
+def test_points_with_poses_of_their_own_are_refused(tmp_path):
+    """Those poses were passed over."""
+    write_sequence(tmp_path / "f.mha", {PAIR: POSES}, np.arange(COUNT) / 20, images=FRAMES)
+    table = pose_table(tmp_path / "p.csv", "u,v,", lambda k: "1,1,")
+    with pytest.raises(InputError, match="holds poses as well as points"):
+        import_files([tmp_path / "f.mha", table])
+
+
+def test_times_that_pair_nothing_may_be_ignored(tmp_path, folder):
+    """The error advised to leave the row out."""
+    table = pose_table(
+        tmp_path / "p.csv", "frame,time,", lambda k: f"{k + 2},{'' if k == 3 else k},"
+    )
+    lines = [
+        f"{k + 2},{'' if k == 3 else k},{u!r},{v!r}" for k, (u, v) in enumerate(POINTS.tolist())
+    ]
+    (tmp_path / "uv.csv").write_text("\n".join(["frame,time,u,v", *lines]))
+    sources = [folder, tmp_path / "uv.csv"]
+    with pytest.raises(FormatError, match=r"\('time'\) is empty"):
+        import_files(sources, ImportOptions(poses=table))
+    recording, *_ = import_files(sources, ImportOptions(poses=table, ignore_time=True))
+    assert len(recording) == COUNT
+    assert recording.calibration.time is None
 
 
 def test_picks_in_a_folder_name_the_images(tmp_path, folder):
@@ -593,6 +618,23 @@ def test_poses_of_other_times(tmp_path, times, message):
     tracking = tracked(times, moving(MOMENTS))
     with pytest.raises(InputError, match=message):
         with_poses_by_time(images, tracking)
+
+
+def test_tracking_that_was_never_ok_is_not_blamed_on_the_clocks():
+    tracking = tracked(MOMENTS, moving(MOMENTS))
+    lost = replace(tracking, valid={PAIR: np.zeros(len(MOMENTS), bool)})
+    with pytest.raises(InputError, match="none of its 200 poses has the status OK"):
+        with_poses_by_time(tracked(MOMENTS[3:9], POSES[:6]), lost)
+
+
+def test_of_poses_with_one_time_stamp_the_first_good_one_counts():
+    times = np.sort(np.r_[MOMENTS, MOMENTS[50]])
+    valid = np.ones(len(times), bool)
+    valid[50] = False
+    tracking = replace(tracked(times, moving(times)), valid={PAIR: valid})
+    track = PoseTrack.of(tracking)
+    assert track.valid.all()
+    np.testing.assert_array_equal(track.time, MOMENTS)
 
 
 def test_images_without_a_time_stamp_are_counted():

@@ -416,7 +416,7 @@ def test_frames_along_the_first_axis(tmp_path, monkeypatch, packed):
         "type: short",
         "dimension: 4",
         "sizes: 5 4 6 1",
-        "kinds: list domain domain domain",
+        "kinds: list space domain domain",
         'labels: "time" "" "" ""',
         "endian: big",
         f"encoding: {'gzip' if packed else 'raw'}",

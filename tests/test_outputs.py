@@ -178,7 +178,6 @@ def test_a_simulation_replaces_a_simulation(folder, monkeypatch, capsys):
     "arguments",
     [
         "import points.txt bench.h5",
-        "segment bench.h5 --out bench.h5",
         "segment rec.h5 --out bench.h5",
         "segment sweep.igs.mha --out bench.h5",
         "simulate bench.h5",
@@ -275,7 +274,7 @@ def test_applied_to_a_recording_of_another_depth_or_body_is_told(folder, capsys)
     images = jaxcal.load("rec.h5").calibration
     size = np.array(random_transform().scale_mm_per_px)
     for name, pixel, body in (("same.h5", size, "Probe"), ("other.h5", 2 * size, "Wand")):
-        changed = replace(images, spacing_mm=pixel)
+        changed = replace(images, spacing_mm=pixel, face_offset_mm=1.5)
         jaxcal.save(Recording(changed, pose_frames=(body, "Tracker")), name)
     record = json.loads((folder / "cal.json").read_text())
     named = record | {"pose_frames": {"from": "Port 1", "to": "Tracker"}}

@@ -319,6 +319,11 @@ def test_the_table_goes_on_and_goes_back(tmp_path):
             picks.pick(frame, *place)
     with pytest.raises(FormatError, match="has points of"):
         picks_of(path, "other.igs.mha")
+    # Points of pixels in another orientation are other points.
+    with pytest.raises(FormatError, match=r"has points of .*, not of .*, orientation UF"):
+        Picks(path, "hard.igs.mha", (COLUMNS, ROWS), COUNT, SHOWN, orientation="UF")
+    # Of the points, only those in frames that are shown count as done.
+    assert Picks(path, "hard.igs.mha", (COLUMNS, ROWS), COUNT, [1, 3, 5]).left == [1, 5]
     path.write_text("frame,u,v\n0,1,1\n")
     with pytest.raises(FormatError, match="was not made by jaxcal pick"):
         picks_of(path)

@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import jaxcal
-from jaxcal import InputError
+from jaxcal import FormatError, InputError
 from jaxcal.cli.main import main
 from jaxcal.io.importing.frame_poses import tool_poses
 from jaxcal.io.importing.sources import ImportOptions
@@ -284,3 +284,7 @@ def test_poses_of_a_tool_are_read_from_sequences_and_tables(tmp_path):
         np.testing.assert_allclose(back @ plain, np.tile(np.eye(4), (len(plain), 1, 1)), atol=1e-9)
     with pytest.raises(InputError, match="--from is for sequences"):
         tool_poses(table, ImportOptions(source="Stylus"))
+    # The inverse of a transposed matrix passed for a pose with a tip at the origin.
+    table.write_text("\n".join(" ".join(map(repr, pose.T.ravel().tolist())) for pose in poses))
+    with pytest.raises(FormatError, match=r"in line 1 is not a rigid transform.*transposed"):
+        tool_poses(table, ImportOptions(invert_poses=True))

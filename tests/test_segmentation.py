@@ -600,17 +600,34 @@ def test_segment_command(raw_file, capfd):
     np.testing.assert_array_equal(images.time_of_flight, before.measurements)
     with h5py.File(target) as file:
         np.testing.assert_array_equal(np.flatnonzero(file["segmentation/failed"]), [4])
-    # Onto itself, with the shortest times instead; 2 % more sound speed is 2 % more range.
-    speed = str(1490.0 * 1.02)
-    shortest = ["--method", "shortest", "--sound-speed", speed, "--out", str(target)]
+    # Not onto itself, since the poses of what is masked out would be lost.
+    assert main(["segment", str(target), "--out", str(target)]) == 2
+    assert "is an input of this command" in capfd.readouterr().err
+    # Once more, with the shortest times instead; 2 % more sound speed is 2 % more range.
+    speed, other = str(1490.0 * 1.02), str(target.with_name("again.h5"))
+    shortest = ["--method", "shortest", "--sound-speed", speed, "--out", other]
     assert main(["segment", str(target), *shortest]) == 0
     assert "11 of 12 images segmented" in " ".join(capfd.readouterr().out.split())
-    again = jaxcal.load(target)
+    again = jaxcal.load(other)
     assert again.calibration.covariance is None
     assert again.probe.sound_speed_m_s == pytest.approx(1490 * 1.02)
     slower = segment(jaxcal.load(raw_file), method="shortest").images
     ratio = again.calibration.measurements[:, 1] / slower.measurements[:, 1]
     np.testing.assert_allclose(ratio[images.mask], 1.02, rtol=1e-9)
+
+
+def test_frames_that_cannot_be_segmented_are_not_passed_over(raw_file, capfd):
+    """Most of those to calibrate with, and all of the test images."""
+    recording = jaxcal.load(raw_file)
+    times = recording.calibration.measurements.copy()
+    times[:8] = np.nan
+    none = replace(recording.calibration, measurements=np.full_like(times, np.nan))
+    calibration = replace(recording.calibration, measurements=times)
+    jaxcal.save(replace(recording, calibration=calibration, test=none), raw_file)
+    assert main(["segment", str(raw_file)]) == 3
+    said = " ".join(capfd.readouterr().out.split())
+    assert "none of the 12 test images could be segmented: there is no test set" in said
+    assert jaxcal.load(raw_file.with_name("raw-segmented.h5")).test is None
 
 
 @pytest.mark.parametrize(

@@ -26,6 +26,7 @@ import jaxcal
 from jaxcal import FormatError, InputError, OutputError
 from jaxcal.cli.main import main
 from jaxcal.data.poses import check_affine, quaternions_from_rotations, rotations_from_quaternions
+from jaxcal.data.recording import Recording, make_images
 from jaxcal.io.itk import itk_from_matrix, itk_text, matrix_from_itk, read_itk, write_itk
 from jaxcal.io.ros import read_ros_yaml
 from jaxcal.io.sequence_files import write_sequence
@@ -805,6 +806,18 @@ def test_apply_to_a_table(saved, tmp_path, capsys):
     assert "the calibration takes pixels" in capsys.readouterr().err
 
 
+def test_apply_tells_of_ranges_that_begin_elsewhere(saved, tmp_path, capsys):
+    known = random_transform()
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    for offset in (known.face_offset_mm, known.face_offset_mm + 7):
+        pixels = make_images(poses, np.full((4, 2), 50.0), "pixel", face_offset_mm=offset,
+                             spacing_mm=known.scale_mm_per_px)  # fmt: skip
+        jaxcal.save(Recording(pixels), tmp_path / "r.h5")
+        assert main(["apply", str(saved), str(tmp_path / "r.h5")]) == 0
+        told = f"- Ranges begin at {known.face_offset_mm:.6g} mm in "
+        assert (told in capsys.readouterr().err) == (offset != known.face_offset_mm)
+
+
 def test_apply_tells_that_the_verdict_expects_more_than_the_covariance_says(tmp_path, capsys):
     recording = jaxcal.simulate_recording(jaxcal.Protocol(images=40), seed=3)
     points = np.array(recording.calibration.measurements)
@@ -1022,7 +1035,9 @@ def test_no_jax(saved, tmp_path):
     done = subprocess.run(
         [sys.executable, "-c", code, saved, tmp_path], capture_output=True, text=True
     )
-    assert (done.returncode, done.stderr) == (0, "")
+    assert done.returncode == 0, done.stderr
+    # Only that the table's ranges begin elsewhere than the calibration's.
+    assert re.fullmatch("- Ranges begin at .* with the first.\n", done.stderr)
 
 
 def test_a_transform_says_its_numbers_and_sds():

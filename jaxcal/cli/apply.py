@@ -80,13 +80,15 @@ def apply(
     transform.check_usable()
     points, poses, numbers = np.array(pixel), None, None
     if source is not None:
-        points, poses, kind, numbers, spacing, frame = _read(source, table)
+        points, poses, kind, numbers, spacing, frame, origin = _read(source, table)
         pixels = transform.scale_mm_per_px is not None
         if kind != ("pixel" if pixels else "point"):
             wanted = "pixels" if pixels else "points in mm"
             raise InputError(f"{source}: holds {kind} data, the calibration takes {wanted}")
         names, sizes = (transform.probe_frame, frame), (transform.scale_mm_per_px, spacing)
-        for note in what_differs(names, sizes, (calibration, source)):
+        ours = transform.face_offset_mm
+        origins = ours, ours if origin is None else origin
+        for note in what_differs(names, sizes, (calibration, source), origins):
             click.echo(f"- {note}", err=True)
     elif transform.scale_mm_per_px is None:
         click.echo(
@@ -127,7 +129,8 @@ def _given(options: dict[str, Any]) -> str:
 def _read(source: str, options: dict[str, Any]):
     """Points, poses or None, the points' kind, and the images or lines that they are of.
 
-    Then the size of a pixel (mm) and the name of the probe's frame, as far as the file knows them.
+    Then the size of a pixel (mm), the name of the probe's frame, and the range of pixel row 0 (mm),
+    as far as the file knows them.
     """
     if _is_recording(source):
         from jaxcal.io.hdf5 import load
@@ -138,7 +141,7 @@ def _read(source: str, options: dict[str, Any]):
         which = "image", used.nonzero()[0].tolist()
         frame = (recording.pose_frames or ("Probe",))[0]
         read = images.measurements[used], images.poses[used], images.kind, which
-        return *read, images.spacing_mm, frame
+        return *read, images.spacing_mm, frame, images.face_offset_mm
     from jaxcal.data.recording import MetresError, check_pose_units
     from jaxcal.io.importing.sources import SEQUENCES, kind_of
     from jaxcal.io.text import read_pose_table
@@ -162,4 +165,4 @@ def _read(source: str, options: dict[str, Any]):
         except MetresError as error:
             raise InputError(f"{source}: {error} (--pose-units m)") from None
     which = ("line", table.lines) if skipping else None
-    return table.points, table.poses, table.kind, which, None, "Probe"
+    return table.points, table.poses, table.kind, which, None, "Probe", None

@@ -264,7 +264,10 @@ def calibrate(
             images = measured.calibration.without(leave_out)
         measured = replace(measured, calibration=images)
         notes.append(f"left out as told: images {runs_in_words(leave_out)}")
-    test_data = None if test is None else segmented(load(test))[0]
+    test_data = None
+    if test is not None:
+        test_data, told = segmented(load(test))
+        notes += [f"{test}: {text}" for text in told]
     check_test_images(measured, test_data)
     _check_exports(measured, targets, inputs)
     prepare_jax()

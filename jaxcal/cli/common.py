@@ -232,7 +232,7 @@ def segmented(recording: Recording) -> tuple[Recording, list[str]]:
     if not raw:
         raise InputError(
             f"{recording.source}: the test images hold times of flight, but the calibration "
-            "images do not: segment them first"
+            "images do not: both must hold points, or both times"
         )
     from jaxcal.data.segmentation.segment import segment_recording
     from jaxcal.io.given_files import naming

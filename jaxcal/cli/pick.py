@@ -50,14 +50,14 @@ def pick(frames: str, picks: str | None, every: int, port: int, **options: Any) 
     asked = ImportOptions(**options)
     name = Path(os.path.abspath(frames)).name
     out = beside(frames, "-picks.csv") if picks is None else picks
-    sequence, _ = open_sequence(frames, asked)
-    shown, size, notes = frames_to_show(sequence, asked, every)
+    sequence, notes = open_sequence(frames, asked)
+    shown, size, further = frames_to_show(sequence, asked, every)
     check_writable(out)
-    placed = Picks(out, name, size, len(sequence), shown, sequence.files)
+    placed = Picks(out, name, size, len(sequence), shown, sequence.files, asked.orientation)
     pictures = Frames(sequence, asked.orientation)
     # What cannot be shown is said here, not on the page.
     pictures.png(shown[0])
-    for note in notes:
+    for note in [*notes, *further]:
         click.echo(f"- {note}")
     with Picker(placed, pictures, name, port) as page:
         try:
@@ -72,7 +72,7 @@ def pick(frames: str, picks: str | None, every: int, port: int, **options: Any) 
 
 
 def _tell(placed: Any, source: str, out: str, options: dict[str, Any]) -> None:
-    count, left = len(placed.points), len(placed.shown) - len(placed.points) - len(placed.skipped)
+    count, left = len(placed.points), len(placed.left)
     if not placed.points and not placed.skipped:
         click.echo(f"no points; {out} was not made")
         return

@@ -59,7 +59,7 @@ def pivot(poses: str, no_robust: bool, as_json: bool, **options: Any) -> int:
         except MetresError as error:
             raise InputError(f"{error} (--pose-units m)") from None
     if as_json:
-        print_json(record)
+        print_json(record | {"notes": notes})
     else:
         print_page(*pivot_lines(record), *(f"- {note}" for note in notes))
     return exit_code([record])

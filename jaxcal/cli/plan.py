@@ -313,7 +313,12 @@ def _from_recording(
     if result.status == "failed":
         raise InputError(f"{path}: the calibration failed: there is nothing to plan from")
     refuse_wrong_lengths(result, path)
-    if probe is not None and measured.probe is None:
+    known = measured.probe
+    if probe is not None and known not in (None, PRESETS[probe]):
+        raise InputError(
+            f"--probe {probe}: {path} holds images of another probe ({known}): leave --probe out"
+        )
+    if probe is not None:
         measured = replace(measured, probe=PRESETS[probe])
 
     def around(region: Region | None) -> Candidates:

@@ -76,8 +76,7 @@ if TYPE_CHECKING:
     "--out",
     type=click.Path(),
     metavar="OUT.h5",
-    help="By default REC-segmented.h5, beside REC. If it is REC itself, REC is replaced, unless "
-    "it is an acquisition with raw data.",
+    help="By default REC-segmented.h5, beside REC.",
 )
 @with_options(TRACKING)
 @with_options(SEARCH)
@@ -95,7 +94,8 @@ def segment(
 
     For a recording, OUT.h5 holds everything that jaxcal reads from REC, including the times of
     flight, and the points in addition; "jaxcal calibrate" then uses the points. Frames with too few
-    answers are masked out and counted. The points of a curvilinear probe are fitted in the image
+    answers are masked out and counted; if these are most of all frames, the exit status is 3. The
+    points of a curvilinear probe are fitted in the image
     plane; the size of the elevational offset by its times (without a sign) is written to the group
     segmentation.
     """
@@ -124,8 +124,8 @@ def segment(
     from jaxcal.io.outputs import RECORDING, check_output, is_recording
 
     target = _default_out(recording) if out is None else out
-    # REC itself may be replaced: all of it is in the output, where it is no acquisition.
-    check_output(target, "a recording", is_recording, endings=RECORDING)
+    # The output has no poses of frames that are masked out, so it does not take REC's place.
+    check_output(target, "a recording", is_recording, [recording], endings=RECORDING)
     data = load(recording)
     check_writable(target)
     probe = _probe(data, sound_speed, temperature)
@@ -138,11 +138,16 @@ def segment(
         print_json(record)
     else:
         _print(record)
-    return ExitCode.CONVERGED
+    return ExitCode.NOT_CONVERGED if _most_lost(found) else ExitCode.CONVERGED
 
 
 _TIMES = ("method", "robust", "scale", "interpolate", "sound_speed", "temperature")
 """Options that belong to times of flight."""
+
+
+def _most_lost(found: Segmentation) -> bool:
+    """Whether fewer than half of the frames could be segmented."""
+    return bool(2 * found.failed.sum() > found.failed.sum() + found.images.mask.sum())
 
 
 def _is_of_frames(source: str) -> bool:

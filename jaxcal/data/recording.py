@@ -61,7 +61,6 @@ OF_SOME = {
     "time_of_flight": "times of flight",
     "amplitude": "amplitudes",
     "time": "time stamps",
-    "frame": "numbers of frames",
 }
 """What :func:`joined` keeps only if both recordings have it, in words."""
 UNIT_OF: dict[Kind, str] = {"point": "mm", "pixel": "px", "time_of_flight": "s"}
@@ -236,8 +235,9 @@ def _checked_names(frames: Any) -> tuple[str, str]:
 def joined(first: Recording, second: Recording) -> Recording:
     """The calibration images of two recordings of one target, in this order, as one recording.
 
-    What only one of them states of every image (covariances, times, ...) is left out, and so is the
-    truth of a simulation. Test images are those of the first.
+    What only one of them states of every image (covariances, times, ...) is left out, and so are
+    the truth of a simulation and the numbers of frames, which would be those of two files. Test
+    images are those of the first.
 
     Raises:
         InputError: the images differ in kind, size of a pixel, probe or frames of the poses.
@@ -288,6 +288,7 @@ def joined(first: Recording, second: Recording) -> Recording:
             a,
             **{name: both(name) for name in ("poses", "measurements", "mask", *OF_SOME)},
             velocity=velocity,
+            frame=None,
             frame_size=a.frame_size or b.frame_size,
         ),
         truth=None,

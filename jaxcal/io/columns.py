@@ -120,7 +120,7 @@ def columns_of_header(names: list[str], quaternion: QuaternionOrder | None) -> C
     bases, units = zip(*(_base_and_unit(name) for name in names), strict=True)
     roles: dict[str, int] = {}
     rest: list[int] = []
-    numbered = [k for k, base in enumerate(bases) if re.fullmatch(r"q[0-4]", base)]
+    numbered = [(int(base[1]), k) for k, base in enumerate(bases) if re.fullmatch("q[0-4]", base)]
     for index, base in enumerate(bases):
         role = _ROLE.get(base)
         if base == "q0" and len(numbered) == 1:
@@ -188,6 +188,8 @@ def _split(name: str) -> tuple[str, str | None]:
 
 def _base_and_unit(name: str) -> tuple[str, str | None]:
     base, unit = _split(name)
+    if base == "seconds" and unit is None:
+        unit = "s"
     if unit is not None and unit not in _UNITS:
         raise FormatError(f"the unit of {quoted(name)} is not known")
     return base, None if unit is None else _UNITS[unit]
@@ -203,16 +205,21 @@ def _complete(roles: dict[str, int], names: tuple[str, ...], what: str) -> tuple
 
 
 def _quaternion(
-    roles: dict[str, int], numbered: list[int], order: QuaternionOrder | None
+    roles: dict[str, int], numbered: list[tuple[int, int]], order: QuaternionOrder | None
 ) -> tuple[int, ...] | None:
+    """Columns of x, y, z, w; None without. ``numbered`` are numbers and columns of q0 to q4."""
     if len(numbered) == 4:
+        where = dict(numbered)
         if order is None:
             raise FormatError(
                 "the quaternion's columns are only numbered: say whether the scalar comes first or "
                 "last (--quaternion wxyz or xyzw)"
             )
-        first = numbered[0]
-        return (*numbered[1:], first) if order == "wxyz" else tuple(numbered)
+        # Columns may stand in any order: their numbers count.
+        columns = [where[number] for number in sorted(where)]
+        if sorted(where) not in ([0, 1, 2, 3], [1, 2, 3, 4]):
+            raise FormatError("the quaternion's columns must be numbered q0 to q3, or q1 to q4")
+        return (*columns[1:], columns[0]) if order == "wxyz" else tuple(columns)
     columns = _complete(roles, ("qx", "qy", "qz", "qw"), "qx, qy, qz and qw")
     if columns is not None and order is not None:
         named = "".join(part for _, part in sorted(zip(columns, "xyzw", strict=True)))

@@ -404,10 +404,14 @@ def _write_fate(target: h5py.Group, found: Segmentation) -> None:
 
 
 def _write_frames(target: h5py.Group, found: FrameResults) -> None:
-    """What became of every frame; ``frame`` has the numbers of those in /calibration, in order."""
+    """What became of every frame that was searched.
+
+    ``row`` has the places in these lists of the images in /calibration, in order;
+    ``/calibration/frame`` has the numbers of their frames.
+    """
     target.attrs["method"] = found.target
     target.attrs["fates"] = ", ".join(FATES)
-    _put(target, "frame", found.found, _FREE)
+    _put(target, "row", found.found, _FREE)
     _put(target, "fate", found.fate, _FREE)
     _put(target, "contrast", found.contrast_db, "dB")
     _put(target, "margin", found.margin_db, "dB")

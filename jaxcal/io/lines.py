@@ -19,7 +19,7 @@ HDF5_BEGINNING = b"\x89HDF\r\n\x1a\n"
 MAXIMUM_BYTES = 64 * 2**20
 """Largest text file that is read."""
 LONGEST_LINE = 2**20
-"""Most characters of a line: a million cells would take a gigabyte."""
+"""Most characters of a line; no table has so many columns."""
 
 
 def text_lines(

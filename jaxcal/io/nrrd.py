@@ -108,12 +108,12 @@ def _of_axis(texts: str, axis: int) -> str:
 def _nrrd_size(fields: dict[str, str]) -> tuple[int, int, int, int]:
     """Columns, rows, channels and frames, from sizes and kinds."""
     sizes = whole_numbers(fields.get("sizes", ""), "sizes")
-    kinds = fields.get("kinds", "").split()
+    kinds = ["domain" if kind == "space" else kind for kind in fields.get("kinds", "").split()]
     if not kinds:
         kinds = ["domain", "domain", "list"][: len(sizes)]
     if len(kinds) != len(sizes) or len(sizes) > 5:
         raise FormatError(f"has {len(sizes)} sizes, but {len(kinds)} kinds")
-    plane = [size for size, kind in zip(sizes, kinds, strict=True) if kind in ("domain", "space")]
+    plane = [size for size, kind in zip(sizes, kinds, strict=True) if kind == "domain"]
     listed = [size for size, kind in zip(sizes, kinds, strict=True) if kind in ("list", "time")]
     others = kinds[0] in ("vector", "RGB-color", "RGBA-color", "3-color", "4-color")
     if kinds[0] == "list":

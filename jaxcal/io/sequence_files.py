@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxcal import InputError
 from jaxcal.data.names import Orientation
-from jaxcal.io.atomic import write_bytes
+from jaxcal.io.atomic import atomic_path, write_bytes
 from jaxcal.io.frame_names import FramePair
 from jaxcal.io.given_files import check_readable, naming
 from jaxcal.io.metaimage import check_data_name, metaimage_header, read_metaimage
@@ -90,7 +90,12 @@ def write_sequence(
         last = f"ElementDataFile = {beside.name}"
         with naming(path):
             check_data_name(beside.name)
-        # The pixels first: a header without them would be half a recording.
-        write_bytes(beside, packed)
     header = "\n".join([*head, *lines, last, ""]).encode()
-    write_bytes(path, header if beside else header + packed)
+    if beside is None:
+        write_bytes(path, header + packed)
+        return
+    # Both are on the disk before one of them takes its name, the pixels first: a header without
+    # them would be half a recording.
+    with atomic_path(path) as prepared:
+        prepared.write_bytes(header)
+        write_bytes(beside, packed)

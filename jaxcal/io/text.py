@@ -291,7 +291,8 @@ def read_poses(
 
     Raises:
         FormatError: a file that cannot be read, a row of another length, something that is not a
-            number, or a quaternion whose length is not 1; the file and the line are named.
+            number, a quaternion whose length is not 1, or what is to be inverted and is no pose;
+            the file and the line are named.
     """
     tabs = first_line(path)[0] == "\t"  # perhaps beside blanks, and at the ends of lines
     table = read_table(path, header=False, separator="" if tabs else None)
@@ -310,7 +311,14 @@ def read_poses(
             except InputError as error:
                 raise FormatError(str(error)) from None
         poses[:, :3, 3] = rows[:, :3] * LENGTHS_MM[pose_units]
-    return inverse_poses(poses) if invert_poses else poses
+    if not invert_poses:
+        return poses
+    # The inverse of what is no pose may look like one.
+    with naming(path):
+        try:
+            return inverse_poses(check_poses(poses, labels=_labels(table.lines)))
+        except InputError as error:
+            raise FormatError(str(error)) from None
 
 
 def _labels(lines: list[int]) -> list[str]:

@@ -285,8 +285,9 @@ def segment_recording(
         options: of :func:`segment`.
 
     Returns:
-        The recording with points instead of times (the times are kept beside them), and what became
-        of the calibration frames.
+        The recording with points instead of times (the times are kept beside them; without test
+        images if none of them could be segmented), and what became of the calibration frames, with
+        warnings about the test images as well.
 
     Raises:
         InputError: as :func:`segment`.
@@ -297,11 +298,15 @@ def segment_recording(
     test = recording.test
     if test is not None and test.kind == "time_of_flight":
         try:
-            test = segment(test, probe, **options).images
+            tested = segment(test, probe, **options)
         except InputError as error:
             raise type(error)(f"test images: {error}") from None
+        told = [f"test images: {text}" for text in tested.warnings]
+        test = tested.images
         if not test.mask.any():
+            told = [f"none of the {len(test)} test images could be segmented: there is no test set"]
             test = None
+        found = replace(found, warnings=(*found.warnings, *told))
     return replace(recording, calibration=found.images, test=test, probe=probe), found
 
 

@@ -65,10 +65,16 @@ def points_of_table(
     """Points of a table, by frame, by time, or in order.
 
     Raises:
-        InputError: no points, a point in no frame, or two points in the same one.
+        InputError: no points, or poses beside them; a point in no frame, or two points in the same
+            one.
     """
     if table.points is None:
         raise InputError(f"{table.name}: holds no points (columns u and v, or lateral and range)")
+    if table.poses is not None:
+        raise InputError(
+            f"{table.name}: holds poses as well as points: import it by itself, without images, or "
+            "leave its poses out"
+        )
     if assignment == "labels":
         raise InputError(f"{table.name}: holds no labels: --points labels is for points of Slicer")
     named = "frame" if table.frame is not None else "file" if sequence.files and table.file else ""

@@ -62,7 +62,8 @@ def opened(
                 "file or frame"
             )
         refuse(options, ("lag_s",), "is for poses that are matched by time, not to a folder")
-        merged, notes = with_pose_table(sequence, read_rows(options.poses, options))
+        table = read_rows(options.poses, options, ignore_time=options.ignore_time)
+        merged, notes = with_pose_table(sequence, table)
         return merged, None, notes
     if of_table:
         table = read_rows(options.poses, options)

@@ -82,8 +82,11 @@ class PoseTrack:
                 f"{source}: the time stamp of pose {back[0] + 1} is before the one before it: two "
                 "recordings in one?"
             )
-        # A tracker that was asked faster than it measures gives the same pose twice.
-        kept = known[np.concatenate([[True], steps > 0])]
+        # A tracker that was asked faster than it measures gives the same pose twice. Of one time
+        # the first pose that can be used counts.
+        group = np.cumsum(np.concatenate([[0], steps > 0]))
+        order = np.lexsort((~usable[known], group))
+        kept = known[order[np.diff(group[order], prepend=-1) > 0]]
         if len(kept) < 2:
             raise InputError(f"{source}: all its poses have one time stamp")
         good = known[usable[known]]
@@ -179,10 +182,13 @@ def with_poses_by_time(
         The sequence, valid where a pose could be interpolated; and notes for the user.
 
     Raises:
-        InputError: images or poses without times, times that go back, no image between poses, or
-            times of poses that are taken for seconds, though hardly any could be of the images.
+        InputError: images or poses without times, times that go back, no pose with the status OK,
+            no image between poses, or times of poses that are taken for seconds, though hardly any
+            could be of the images.
     """
     track = PoseTrack.of(tracking)
+    if not track.valid.any():
+        raise InputError(f"{track.source}: none of its {len(track.time)} poses has the status OK")
     if untimed := int((~np.isfinite(images.time)).sum()):
         raise InputError(
             f"{images.source}: {untimed} of {len(images)} images have no time stamp, so their "

@@ -265,7 +265,7 @@ def _points(
                 "change it to 1 and place the points again"
             )
         return points_of_markups(source, sequence, options.points)
-    table = read_rows(source, options)
+    table = read_rows(source, options, ignore_time=options.ignore_time)
     if table.poses is None and (options.poses is None or kind_of(options.poses) != "table"):
         refuse(options, ("quaternion",), "is for tables with poses, and none is read")
     return points_of_table(table, sequence, options.points)

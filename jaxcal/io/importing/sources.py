@@ -133,8 +133,8 @@ def read_rows(
 ) -> PoseTable:
     """The table of a source of the kind ``table``.
 
-    ``ignore_time`` is not taken from the options: times that pair poses or points with frames are
-    always read.
+    ``ignore_time`` is not taken from the options: times that pair poses with frames are always
+    read.
     """
     return read_pose_table(
         source,

@@ -46,6 +46,7 @@ class Picks:
         count: of its frames.
         shown: numbers of the frames to place points in, from 0.
         files: names of the images of a folder; empty for a sequence.
+        orientation: of the stored pixels where it was stated, since the points depend on it.
 
     Attributes:
         points: [u, v] by the number of the frame, px.
@@ -65,6 +66,7 @@ class Picks:
         count: int,
         shown: Sequence[int],
         files: Sequence[str] = (),
+        orientation: str | None = None,
     ) -> None:
         self.files = tuple(files)
         self.path, self.shown, self.size = os.fspath(path), list(shown), size
@@ -76,7 +78,8 @@ class Picks:
                 )
         # As the file will have it, also where the name is not UTF-8 or has several lines.
         named = " ".join(name.encode("utf-8", errors="backslashreplace").decode().splitlines())
-        self._head = f"{_HEAD}{named}: {size[0]} x {size[1]} px, {count} frames"
+        stated = f", orientation {orientation}" if orientation else ""
+        self._head = f"{_HEAD}{named}: {size[0]} x {size[1]} px, {count} frames{stated}"
         self.points: dict[int, Point] = {}
         self.skipped: set[int] = set()
         self._before: list[tuple[int, Point | None, bool]] = []
@@ -87,7 +90,12 @@ class Picks:
     @property
     def next_frame(self) -> int | None:
         """The first frame that was neither picked nor skipped; None where there is none."""
-        return next((k for k in self.shown if k not in self.points and k not in self.skipped), None)
+        return next(iter(self.left), None)
+
+    @property
+    def left(self) -> list[int]:
+        """Frames to place points in that were neither picked nor skipped."""
+        return [k for k in self.shown if k not in self.points and k not in self.skipped]
 
     def pick(self, frame: int, u: float, v: float) -> None:
         """Set the point of a frame.
