@@ -104,6 +104,19 @@ def quaternions_misread(poses: np.ndarray) -> np.ndarray:
     return poses
 
 
+def euler_misread(poses: np.ndarray) -> np.ndarray:
+    """Angles about moving axes, read as about fixed ones."""
+    angles = Rotation.from_matrix(poses[:, :3, :3]).as_euler("XYZ")
+    poses[:, :3, :3] = Rotation.from_euler("xyz", angles).as_matrix()
+    return poses
+
+
+def radians_as_degrees(poses: np.ndarray) -> np.ndarray:
+    vectors = Rotation.from_matrix(poses[:, :3, :3]).as_rotvec()
+    poses[:, :3, :3] = Rotation.from_rotvec(vectors, degrees=True).as_matrix()
+    return poses
+
+
 def mirrored(poses: np.ndarray) -> np.ndarray:
     poses[:, 1, 3] *= -1
     return poses
@@ -141,6 +154,8 @@ SLIPS: dict[str, tuple[Callable[[Arrays], Arrays], tuple[str, ...]]] = {
     "inverse poses": (with_poses(inverse_poses), ("invert",)),
     "transposed rotations": (with_poses(transposed), ("transpose",)),
     "quaternions misread": (with_poses(quaternions_misread), ("first but is read as last",)),
+    "Euler angles misread": (with_poses(euler_misread), ("in place of Rx Ry Rz",)),
+    "radians as degrees": (with_poses(radians_as_degrees), ("radians",)),
     "one translation mirrored": (with_poses(mirrored), ("wrong sign",)),
     "translations exchanged": (with_poses(exchanged), ("exchanged",)),
     "left-handed poses": (with_poses(left_handed), ("reflection",)),

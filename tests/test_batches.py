@@ -106,6 +106,19 @@ def test_a_conventional_fit_knows_the_size_of_each_axis_errors():
     assert (covered[[1, 3, 5]] < 0.99).all()
 
 
+def test_frames_of_one_pose_in_a_batch_are_told_of():
+    """They are counted as independent: the SDs are too small, and the verdict says so."""
+    images = experiment(3, images=12).calibration
+    rows = [*range(6), *range(5)]
+    one = jaxcal.Problem.from_arrays(images.poses[rows], images.measurements[rows])
+    found = jaxcal.calibrate_batch(jaxcal.stack([one] * 6), "conventional")[0]
+    told = f"{IMAGES} images have only 6 different poses, and each counts as independent"
+    assert any(told in text for text in found.warnings)
+    assert any("counted as independent" in line for line in found.verdict())
+    alone = jaxcal.calibrate(one, "conventional")
+    assert not any("counts as independent" in text for text in alone.warnings)
+
+
 @pytest.mark.slow
 def test_compiler_flags_change_rounding_only(monkeypatch):
     problems = jaxcal.stack([drawn(k, elevation_mm=1.5, noise_mm=1.0) for k in range(3)])

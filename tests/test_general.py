@@ -245,6 +245,15 @@ def test_what_the_pieces_cannot_take_is_said_in_a_sentence():
             for made in (None, jnp.zeros(4), jnp.zeros((3, 2)), jnp.zeros((4, 0)))
         ),
         (
+            lambda: backend.arrow_least_squares(
+                lambda s, y, d: jnp.stack([s + y - d, y - jnp.roll(y, 1)], 1),
+                jnp.asarray(1.0),
+                np.zeros(10),
+                jnp.arange(10.0),
+            ),
+            "depends on the local unknown of another row",
+        ),
+        (
             lambda: backend.count_unknowns(("rotation", "angle")),
             "'angle' is no unknown: choose from trans",
         ),

@@ -164,14 +164,20 @@ def test_images_that_are_as_noisy_as_their_covariances_say_are_no_outliers():
     covariance = jnp.asarray(sd[:, :, None] ** 2 * np.eye(2))
     data = replace(data, measurements=jnp.asarray(points))
     # With common SDs nothing is known of them, and some stand out.
-    assert np.asarray(jaxcal.calibrate(data).outlier)[noisy].sum() > 2
+    common = jaxcal.calibrate(data)
+    assert np.asarray(common.outlier)[noisy].sum() > 2
+    # The same numbers as given SDs, in metres by mistake.
+    for unit, told in ((1.0, ""), (1e-3, "times the given SDs, so that covariance and")):
+        given = replace(common, sigma=unit * common.sigma, sigma_tuned=jnp.asarray(False))
+        assert told in " ".join(given.warnings)
+        assert ("are the SDs in mm?" in " ".join(given.warnings)) == bool(told)
     found = jaxcal.calibrate(replace(data, covariance=covariance))
     assert found.offset_law is not None
     assert float(found.offset_law.own_probability) > 0.9
     assert not np.asarray(found.outlier).any()
     points[7, 0] += 5.0
     wrong = replace(data, measurements=jnp.asarray(points), covariance=covariance)
-    found = jaxcal.calibrate(wrong, prior="gaussian")
+    found = jaxcal.calibrate(wrong)
     assert np.flatnonzero(np.asarray(found.outlier)).tolist() == [7]
 
 
@@ -184,6 +190,11 @@ def test_complaints_are_warnings_in_words():
     assert any(
         "noise model: the range errors have heavier tails" in text for text in spoilt.warnings
     )
+    careless = "errors within the image of"
+    assert not any(careless in text for text in result.warnings)
+    noise = 3.0 * np.random.default_rng(1).normal(size=(40, 2))
+    noisy = replace(data, measurements=data.measurements + noise)
+    assert any(careless in text for text in jaxcal.calibrate(noisy, "conventional").warnings)
     few = jaxcal.calibrate(replace(data, mask=data.mask.at[12:].set(0.0)), "conventional")
     assert not few.inspection.misfit.any()
     assert not noise_model(few)["checked"]

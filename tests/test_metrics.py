@@ -4,7 +4,15 @@ import numpy as np
 import pytest
 from test_geometry import random_poses
 
-from jaxcal import InputError, calibration_reproducibility, reconstruction_precision
+from jaxcal import (
+    InputError,
+    Problem,
+    Protocol,
+    calibrate,
+    calibration_reproducibility,
+    reconstruction_precision,
+    simulate_recording,
+)
 
 
 def test_reconstruction_precision_is_the_norm_of_unbiased_sds():
@@ -26,6 +34,14 @@ def test_reconstruction_precision_is_the_norm_of_unbiased_sds():
     poses[2], points[5] = np.nan, np.inf
     masked = reconstruction_precision(transform, poses, points, mask > 0)
     np.testing.assert_allclose(masked, expected)
+
+
+def test_the_precision_of_a_calibration_is_that_of_its_transform():
+    images = simulate_recording(Protocol(images=8), seed=1).calibration
+    result = calibrate(Problem.from_arrays(images.poses, images.measurements), "conventional")
+    given = images.poses, images.measurements
+    expected = reconstruction_precision(result.image_to_probe, *given)
+    np.testing.assert_array_equal(reconstruction_precision(result, *given), expected)
 
 
 def test_a_single_image_has_no_scatter():

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 from subprocess import PIPE
 
 import numpy as np
@@ -104,6 +105,26 @@ def test_a_file_of_other_arrays_is_refused(squares, tmp_path):
         open_results(tmp_path / "study")
 
 
+def test_the_class_of_a_script_is_refused_before_anything_starts(tmp_path, squares):
+    """A worker's traceback followed the error, which told to do what had been done."""
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from loose_squares import Squares\nfrom jaxcal.study import run_study\n"
+        "class Mine(Squares):\n    pass\nrun_study(Mine(), 'out', workers=2)\n"
+    )
+    folder = Path(where_defined(squares())["folder"])
+    done = subprocess.run(
+        [sys.executable, script], cwd=tmp_path, env=os.environ | {"PYTHONPATH": f"{folder}"},
+        capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1].endswith(
+        "workers cannot import Mine, which is defined in the script that runs: put it into a "
+        "module of its own, and import it"
+    )
+    assert not (tmp_path / "out").exists()
+
+
 def test_the_class_must_be_one_that_a_worker_can_import(squares):
     where = where_defined(squares())
     assert where["module"] == "loose_squares"
@@ -112,7 +133,7 @@ def test_the_class_must_be_one_that_a_worker_can_import(squares):
     class Inside(squares):
         pass
 
-    with pytest.raises(InputError, match="cannot import"):
+    with pytest.raises(InputError, match="define it at the top level of its module"):
         where_defined(Inside())
     with pytest.raises(InputError, match="cannot be imported"):
         study_from({"module": "no_such_module", "name": "Squares"}, "{}")

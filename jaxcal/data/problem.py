@@ -297,6 +297,11 @@ class Problem:
         Raises:
             InputError: arrays that cannot be a calibration problem; the row is named.
         """
+        if kind == "time_of_flight":
+            raise InputError(
+                "from_arrays takes points and pixels; times of flight need a recording with its "
+                "probe: jaxcal.Recording(jaxcal.make_images(...), probe=...)"
+            )
         images = make_images(
             poses,
             measurements,

@@ -430,7 +430,8 @@ def make_images(
 
 def _check_shape(values: np.ndarray, kind: Kind, count: int) -> None:
     if values.ndim != 2:
-        raise InputError(f"{kind} must have two axes, it has shape {values.shape}")
+        several = " (one problem at a time: jaxcal.stack makes a batch)" if values.ndim == 3 else ""
+        raise InputError(f"{kind} must have two axes, it has shape {values.shape}{several}")
     if kind != "time_of_flight" and values.shape[1] != 2:
         raise InputError(f"{kind} must have shape (n, 2), it has {values.shape}")
     if len(values) != count:
@@ -441,7 +442,8 @@ def _refuse(name: str, bad: Any, what: str) -> None:
     """Refuse an array of which a row is bad, by (n,) bool; the first one is named."""
     rows = np.flatnonzero(bad)
     if len(rows):
-        raise InputError(f"{name} {rows[0]} {what}")
+        several = f" (the first of {len(rows)}, counted from 0)" if len(rows) > 1 else ""
+        raise InputError(f"{name} {rows[0]}{several} {what}")
 
 
 def _shaped(values: Any, name: str, shape: tuple[int, ...]) -> np.ndarray:
@@ -471,10 +473,18 @@ def used_values(
         _refuse(kind, np.isinf(values).any(axis=1), "holds NaN or Inf")
         return values
     values[~used] = 1.0
-    _refuse(kind, ~np.isfinite(values).all(axis=1), "holds NaN or Inf")
+    _refuse(
+        kind,
+        ~np.isfinite(values).all(axis=1),
+        "holds NaN or Inf: mask out images without the target",
+    )
     _check_magnitude(kind, values, used)
     if kind == "point":
-        _refuse(kind, values[:, 1] <= 0, "has a range that is not positive")
+        _refuse(
+            kind,
+            values[:, 1] <= 0,
+            "has a range that is not positive: are lateral position and range exchanged?",
+        )
         return values
     above = np.flatnonzero(values[:, 1] < 0)
     if len(above):
@@ -488,7 +498,8 @@ def used_values(
 def check_kind(kind: object) -> None:
     """Refuse another kind of measurements than there are."""
     if kind not in get_args(Kind):
-        raise InputError(f"kind must be one of {', '.join(get_args(Kind))}, not {shown(kind)}")
+        known = ", ".join(f"{name} ({UNIT_OF[name]})" for name in get_args(Kind))
+        raise InputError(f"kind must be one of {known}, not {shown(kind)}")
 
 
 def check_spacing(spacing_mm: Any, kind: Kind) -> Float[np.ndarray, " 2"] | None:

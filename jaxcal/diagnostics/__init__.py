@@ -6,6 +6,7 @@
     residual_checks  images that stand out, the fit of the noise model, which poses to add
     sd_by_place      how the SD of an error depends on the target's place in the image
     frame_checks     wrong frames or units
+    wrong_angles     rotations as they would be if their angles had been read in another way
     unmodelled       errors that the model leaves out and that the residuals show
     tracker_distortion   one of these: tracked positions that are off, smoothly in space
     second_target    another one: images of two targets, or with two origins

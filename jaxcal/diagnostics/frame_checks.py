@@ -5,6 +5,7 @@ columns instead of rows, or one axis with the other sign all give a converged an
 of millimetres. So the conventional fit (Eq. 7) is repeated with each of the common mistakes
 corrected. The fit is in closed form with both scales free, so it needs no start, no JAX and only a
 few tenths of a millisecond. Where a corrected fit is far better, the mistake is reported.
+Rotations that were built from angles in a wrong way are in :mod:`jaxcal.diagnostics.wrong_angles`.
 
 *Far better* means two things. Both fits have n images, p unknowns and errors of unknown size. With
 f the sum of squares as given and f' the corrected one, the likelihood ratio is
@@ -33,6 +34,7 @@ import numpy as np
 from jaxcal import InputError
 from jaxcal.data.poses import quaternions_from_rotations, rotations_from_quaternions
 from jaxcal.data.problem import Problem
+from jaxcal.diagnostics.wrong_angles import with_other_angles
 from jaxcal.runtime.array_types import Float
 from jaxcal.solvers.closed_form.reduced_objective import (
     CONSTRAINTS,
@@ -318,6 +320,8 @@ def _mistakes(data: ImageData) -> Iterator[tuple[str, dict[str, np.ndarray]]]:
             f"the columns {name} of the poses' translations are exchanged: put them in order",
             {"translations": shifts[:, order]},
         )
+    for words, corrected in with_other_angles(rotations):
+        yield words, {"rotations": corrected}
 
 
 def _steps(data: ImageData, farther: bool) -> Iterator[tuple[str, ImageData, float]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from jaxcal import InputError
+from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import AnyArray, Bool, Float
 from jaxcal.runtime.arrays import array_module, is_traced
 from jaxcal.runtime.given_values import traceable_array, truth_array
@@ -13,7 +14,7 @@ from jaxcal.runtime.jax_modes import traceable
 
 @traceable
 def reconstruction_precision(
-    image_to_probe: Float[AnyArray, "4 4"],
+    image_to_probe: Float[AnyArray, "4 4"] | Calibration,
     poses: Float[AnyArray, "n 4 4"],
     points: Float[AnyArray, "n columns"],
     mask: Float[AnyArray, " n"] | Bool[AnyArray, " n"] | None = None,
@@ -21,7 +22,7 @@ def reconstruction_precision(
     """Point reconstruction precision, Eq. 8: norm of the SD of B_i X p_i over the images, mm.
 
     Args:
-        image_to_probe: (4, 4) X, mm.
+        image_to_probe: (4, 4) X, mm; or a calibration.
         poses: B_i of the *test* images, probe -> tracker, mm.
         points: (n, 2) [lateral, range], assumed in the plane, or (n, 3) in the image frame, mm.
         mask: (n,) True (or 1) for images to count; all by default. The others may hold anything.
@@ -33,14 +34,15 @@ def reconstruction_precision(
         InputError: shapes that do not agree, what are no numbers, a mask of other numbers than 0
             and 1, or fewer than two images to count.
     """
-    xp = array_module(image_to_probe, poses, points, mask)
-    image_to_probe = traceable_array(image_to_probe, "image_to_probe")
+    given = image_to_probe
+    x = given.image_to_probe if isinstance(given, Calibration) else given
+    xp, x = array_module(x, poses, points, mask), traceable_array(x, "image_to_probe")
     poses, points = traceable_array(poses, "poses"), traceable_array(points, "points")
     if mask is not None and not is_traced(mask):
         mask = truth_array(mask, "mask")
     count = len(poses) if poses.ndim else 0
     for name, values, shapes in (
-        ("image_to_probe", image_to_probe, [(4, 4)]),
+        ("image_to_probe", x, [(4, 4)]),
         ("poses", poses, [(count, 4, 4)]),
         ("points", points, [(count, 2), (count, 3)]),
         ("mask", mask, [(count,)]),
@@ -51,7 +53,7 @@ def reconstruction_precision(
     if mask is not None:
         poses = xp.where(mask[:, None, None] > 0, poses, 0.0)
         points = xp.where(mask[:, None] > 0, points, 0.0)
-    cloud = reconstruct(image_to_probe, poses, points)
+    cloud = reconstruct(x, poses, points)
     weight = xp.ones(poses.shape[0], cloud.dtype) if mask is None else mask
     weight = weight.astype(cloud.dtype)[:, None]
     count = xp.sum(weight)

@@ -16,6 +16,10 @@ from jaxcal.solvers.plan import TUNED
 
 IMPLAUSIBLE_RMS_MM = 10.0
 """Residuals with a larger root mean square do not come from a target within the beam."""
+CARELESS_MM = 1.5
+"""Errors within the image with a larger SD are not those of points placed with care."""
+OTHER_THAN_GIVEN = 3.0
+"""Residuals contradict given SDs if they are so many times as large, or as small."""
 USUAL_PIXEL_MM = (0.02, 1.0)
 """Estimated pixel sizes outside this interval lead to a warning."""
 _MILLIMETRE = 0.1
@@ -55,11 +59,13 @@ def warnings(result: Calibration) -> list[str]:
         *_without_convergence(result),
         *result.notes,
         *_implausible_residuals(result),
+        *_repeated_poses(result),
         *_weak_direction(result),
         *_only_the_bound(result),
         *_odd_start_or_end(result),
         *_bound_not_kept(result),
         *_sds_not_tuned(result),
+        *_other_than_given(result),
         *_weak_elevation(result),
         *_medium_warnings(result),
         *_unusual_pixels(result),
@@ -87,11 +93,41 @@ def _without_convergence(result: Calibration) -> list[str]:
 def _implausible_residuals(result: Calibration) -> list[str]:
     """Residuals that no ultrasound beam explains."""
     rms = float(result.rms)
-    if not rms > IMPLAUSIBLE_RMS_MM:
+    if rms > IMPLAUSIBLE_RMS_MM:
+        return [
+            f"residuals of {rms:.1f} mm are larger than a beam is thick: either some images are "
+            "far off, or the poses are wrong (order or signs of their numbers, units, direction)"
+        ]
+    lateral, distance = (float(size) for size in np.asarray(result.sigma)[:2])
+    if not max(lateral, distance) > CARELESS_MM:
         return []
     return [
-        f"residuals of {rms:.1f} mm are larger than a beam is thick: either some images are "
-        "far off, or the poses are wrong (order or signs of their numbers, units, direction)"
+        f"errors within the image of {lateral:.1f} mm (lateral) and {distance:.1f} mm (range) are "
+        "larger than those of points placed with care: are the poses right (order of angles, "
+        "signs, times), and is it one target?"
+    ]
+
+
+def different_poses(result: Calibration) -> int | None:
+    """How many of the poses in use are not exactly that of another image; None without a problem.
+
+    A single calibration lets every pose count once, a batch does not.
+    """
+    if result.problem is None:
+        return None
+    poses = np.asarray(result.problem.poses)[np.asarray(result.mask) > 0]
+    return len(np.unique(poses.reshape(len(poses), -1), axis=0))
+
+
+def _repeated_poses(result: Calibration) -> list[str]:
+    """Frames of one pose that were counted as independent images, as in a batch."""
+    used, poses = int(result.images_used), different_poses(result)
+    if poses is None or poses == used:
+        return []
+    return [
+        f"{used} images have only {poses} different poses, and each counts as independent, as in a "
+        "batch and in a jit: the stated error is too small. Solve the problem by itself "
+        "(jaxcal.calibrate), which lets every pose count once"
     ]
 
 
@@ -141,6 +177,24 @@ def _sds_not_tuned(result: Calibration) -> list[str]:
             f"the {' and '.join(names)} {rest} too small to estimate; {owner} at the lower limit"
         )
     return found
+
+
+def _other_than_given(result: Calibration) -> list[str]:
+    """Given SDs that the residuals contradict."""
+    given, used = np.asarray(result.sigma, float), np.asarray(result.mask) > 0
+    if result.prior not in TUNED or result.sigma_tuned or result.data != "points":
+        return []
+    if used.sum() < MINIMUM_SELF_TUNING:
+        return []  # they are the default ones
+    squares = np.mean(np.asarray(result.residual, float)[used] ** 2, axis=0)[[0, 2, 1]]
+    ratio = float(np.max(np.sqrt(squares) / given))
+    if 1 / OTHER_THAN_GIVEN <= ratio <= OTHER_THAN_GIVEN:
+        return []
+    small = "small" if ratio > 1 else "large"
+    return [
+        f"the residuals are {ratio:.3g} times the given SDs, so that covariance and predicted "
+        f"errors are too {small}: are the SDs in mm?"
+    ]
 
 
 def _weak_elevation(result: Calibration) -> list[str]:

@@ -31,6 +31,7 @@ from jaxcal.diagnostics.influence import Influence, conventional_fit, excess, in
 from jaxcal.diagnostics.intervals import image_jacobian, predicted_tre, tre_at, tre_over
 from jaxcal.diagnostics.outlier_agreement import agreeing_outliers, apart_in_image
 from jaxcal.diagnostics.unmodelled import unmodelled
+from jaxcal.diagnostics.warnings import different_poses
 from jaxcal.model.image_points import mean_of_squares
 from jaxcal.report.contradictions import contradictions
 from jaxcal.report.thresholds import FAIR_MM, GOOD_MM, WIDEST
@@ -76,6 +77,7 @@ def accuracy_record(
     tre["unmodelled"] = _unmodelled(answer, grid, recording.calibration.velocity)
     away = away_from_gaussian(answer, grid)
     tre["gaussian_offsets"] = away and dict(zip(("apart_mm", "error_mm"), away, strict=True))
+    tre["different_poses"] = different_poses(answer)
     tre["slow_path"] = slowness(recording.calibration.poses[np.asarray(answer.mask) > 0])
     agreeing = agreeing_outliers(answer, float(tre["stated_mm"]), grid)
     edge = clipped(answer, grid)

@@ -3,6 +3,7 @@
 The covariance assumes that the noise model holds. It is contradicted if
 
 - the residuals are larger than a beam is thick (10 mm);
+- images of exactly one pose were counted as independent, as in a batch;
 - the residuals make the error larger than their SDs do by more than three SDs of chance;
 - leaving one image out moves image points by more than half the stated error and by more than four
   times the expected move (by one step from the normal equations, or by cross-validation if this was
@@ -86,6 +87,7 @@ def contradictions(record: dict[str, Any]) -> list[tuple[float, str]]:
     """
     checks = (
         _from_large_residuals,
+        _from_repeated_poses,
         _from_residuals,
         _from_images,
         _from_resampling,
@@ -110,6 +112,15 @@ def _from_large_residuals(record: dict[str, Any]) -> list[tuple[float, str]]:
     if not rms or not stated or rms <= IMPLAUSIBLE_RMS_MM:
         return []
     return [(rms / stated, f"residuals of {rms:.1f} mm are larger than a beam is thick")]
+
+
+def _from_repeated_poses(record: dict[str, Any]) -> list[tuple[float, str]]:
+    """Frames of one pose that counted as independent images, as in a batch."""
+    used, poses = record["images_used"], record["tre"]["different_poses"]
+    if not poses or poses == used:
+        return []
+    words = f"{used} images with {poses} different poses were counted as independent"
+    return [(math.sqrt(used / poses), words)]
 
 
 def _from_residuals(record: dict[str, Any]) -> list[tuple[float, str]]:

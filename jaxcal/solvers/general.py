@@ -88,24 +88,26 @@ class Flat(eqx.Module):
 class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     """The package's Levenberg-Marquardt as a solver of optimistix, for dense residuals.
 
+    The first attributes are those of optimistix's own solvers, in their order.
+
     Attributes:
-        tolerance: gradient cosine to stop at: the largest between the residuals and a column of
-            their Jacobian; by default 1e-10 in float64, 1e-4 in float32.
-        damping: first lambda, relative to the diagonal.
         rtol: without effect; optimistix asks every solver for it.
         atol: ``optimistix.root_find`` takes an answer for a root if the norm of its residuals is
             below this; without effect in ``optimistix.least_squares``.
         norm: see ``atol``; by default the largest magnitude.
+        tolerance: gradient cosine to stop at: the largest between the residuals and a column of
+            their Jacobian; by default 1e-10 in float64, 1e-4 in float32.
+        damping: first lambda, relative to the diagonal.
 
     Raises:
         InputError: a tolerance, damping or ``atol`` below zero, or one that is no number.
     """
 
-    tolerance: float | None = None
-    damping: float = 1e-3
     rtol: float = 0.0
     atol: float = 1e-6
     norm: Callable[[PyTree], Array] = optx.max_norm
+    tolerance: float | None = None
+    damping: float = 1e-3
 
     def __check_init__(self) -> None:
         given = {"damping": self.damping, "atol": self.atol}
@@ -213,7 +215,8 @@ def arrow_least_squares(
 
     Raises:
         InputError: shared unknowns that are integers, local ones that are not one a row, residuals
-            of another shape; a ``limit``, ``tolerance`` or ``damping`` below zero; ``max_steps``
+            of another shape, or (outside transformations) rows that depend on the local unknowns of
+            other rows; a ``limit``, ``tolerance`` or ``damping`` below zero; ``max_steps``
             that is no whole number.
     """
     whole_number("max_steps", max_steps, 1, MOST_STEPS)
@@ -229,9 +232,11 @@ def arrow_least_squares(
         got = f"an array of shape {shape}" if shape is not None else f"a {type(made).__name__}"
         raise InputError(f"residual must return a ({rows or 'n'}, columns) array, not {got}")
     bound = _bound(limit, rows).astype(flat.dtype)
+    function = _FlatResidual(residual, unravel)
+    if not is_traced((shared, local, args)):
+        _check_locality(function, first, args)
 
     solver = _ArrowSolver(tolerance=tolerance, damping=damping, limit=bound)
-    function = _FlatResidual(residual, unravel)
     solution = optx.least_squares(function, solver, first, args, max_steps=max_steps, throw=throw)
     found = solution.value
     return eqx.tree_at(lambda s: s.value, solution, (unravel(found[0]), found[1]))
@@ -245,6 +250,40 @@ class _FlatResidual(eqx.Module):
 
     def __call__(self, unknowns: tuple[Array, Array], args: Any) -> Float[Array, "n columns"]:
         return self.residual(self.unravel(unknowns[0]), unknowns[1], args)
+
+
+def _check_locality(function: _FlatResidual, first: tuple[Array, Array], args: Any) -> None:
+    """Refuse residuals whose rows depend on other rows' local unknowns.
+
+    The derivatives are along a direction of random signs, and along its positive part. In rows with
+    a positive sign both are the same, unless such a row depends on a row with a negative one.
+    """
+    signs = np.where(np.random.default_rng(0).random(len(first[1])) < 0.5, -1.0, 1.0)
+    along = jnp.asarray([signs, np.maximum(signs, 0.0)], first[1].dtype)
+    whole, part = np.asarray(_derivatives(function, first, args, along))[:, signs > 0]
+    largest = np.max(np.abs(whole), initial=0.0)
+    # What is not finite is for the solver to tell of.
+    if np.max(np.abs(whole - part), initial=0.0) > _SAME * largest:
+        raise InputError(
+            "a row of the residuals depends on the local unknown of another row: the rows must "
+            "depend on their own one only (and on the shared ones)"
+        )
+
+
+@eqx.filter_jit
+def _derivatives(
+    function: _FlatResidual, at: tuple[Array, Array], args: Any, along: Float[Array, "k n"]
+) -> Float[Array, "k n columns"]:
+    """Derivatives of residuals by the local unknowns along some directions."""
+
+    def rows(local: Array) -> Array:
+        return function((at[0], local), args)
+
+    return jax.vmap(lambda way: jax.jvp(rows, (at[1],), (way,))[1])(along)
+
+
+_SAME = 1e-3
+"""Two derivatives are the same if they differ by less than this share of the largest."""
 
 
 def _bound(limit: Any, rows: int) -> Float[Array, " n"]:

@@ -104,9 +104,14 @@ def where_defined(study: Study) -> dict[str, str]:
         InputError: a class of the main script, or one inside a function.
     """
     kind = type(study)
-    if kind.__module__ == "__main__" or "." in kind.__qualname__:
+    if kind.__module__ == "__main__":
         raise InputError(
-            f"workers cannot import {kind.__qualname__}: define it at the top of a module"
+            f"workers cannot import {kind.__qualname__}, which is defined in the script that runs: "
+            "put it into a module of its own, and import it"
+        )
+    if "." in kind.__qualname__:
+        raise InputError(
+            f"workers cannot import {kind.__qualname__}: define it at the top level of its module"
         )
     found = {"module": kind.__module__, "name": kind.__name__}
     if "." not in kind.__module__:

@@ -17,7 +17,7 @@ from jaxcal.runtime.given_values import check_flag, whole_number
 from jaxcal.runtime.interrupts import no_interrupt_lost
 from jaxcal.runtime.messages import shown
 from jaxcal.study.cluster import compute_on_cluster, connected
-from jaxcal.study.interface import Chunk, Results, Study, computed
+from jaxcal.study.interface import Chunk, Results, Study, computed, where_defined
 from jaxcal.study.store import Store, versions_in_words
 
 if TYPE_CHECKING:
@@ -86,8 +86,8 @@ def run_study(
         watcher: is told about the progress.
 
     Raises:
-        InputError: no study, another spec's results are there, the folder is in use, or no
-            scheduler answers; nothing was written then.
+        InputError: no study, one whose class other processes cannot import, another spec's results
+            are there, the folder is in use, or no scheduler answers; nothing was written then.
         OutputError: the folder or a file cannot be written; what was written before stays.
         MissingExtraError: Dask is needed and not installed.
         CalibrationError: the cluster was lost, or a chunk failed in another process, whose error is
@@ -103,6 +103,8 @@ def run_study(
     watcher = Silence() if watcher is None else watcher
     if not isinstance(watcher, Watcher):
         raise InputError(f"watcher must have begin, advance and note, not {shown(watcher)}")
+    if workers or scheduler is not None:
+        where_defined(spec)  # says if other processes cannot import it
     begun = time.monotonic()
     # First of all, so that no folder is made where nothing can be computed.
     with (

@@ -3,7 +3,7 @@
 Means are over all trials with a finite result, including those that did not converge: leaving them
 out would flatter a method that fails in bad cases. Such trials are counted beside the mean.
 Intervals are Student's 95 % intervals of the mean over trials. A difference is between two methods
-on the same experiment.
+on the same experiment: a method and the conventional one, or the first one if there is none.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ class Row:
         sd_mm: SD of RP over trials.
         low_mm: lower end of the mean's confidence interval.
         high_mm: its upper end.
-        difference_mm: mean of RP minus conventional's RP, paired; None for the conventional method,
-            or without one.
+        difference_mm: mean of RP minus the reference's RP, paired; None for the reference itself
+            (:func:`reference`).
         difference_low_mm: lower end of the difference's confidence interval, or None.
         difference_high_mm: its upper end, or None.
         rotation_rad: root mean square error of X's rotation.
@@ -86,7 +86,7 @@ def summarise(store: Store[Spec]) -> list[Cell]:
     spec, by_condition = store.spec, {}
     for index in store.present():
         by_condition.setdefault(index // spec.chunks_per_condition, []).append(index)
-    reference = next((k for k, m in enumerate(spec.methods) if m.method == "conventional"), None)
+    compared = reference(spec)
     cells = []
     for number, indices in sorted(by_condition.items()):
         condition = spec.condition(number)
@@ -95,9 +95,18 @@ def summarise(store: Store[Spec]) -> list[Cell]:
             name: np.concatenate([part[name] for part in parts], axis=1)
             for name in ("rp", "status", "iterations", "rotation_error", "translation_error")
         }
-        rows = tuple(_row(spec, condition, got, k, reference) for k in range(len(spec.methods)))
+        rows = tuple(_row(spec, condition, got, k, compared) for k in range(len(spec.methods)))
         cells.append(Cell(condition, rows))
     return cells
+
+
+def reference(spec: Spec) -> int:
+    """Number of the method that the others are compared with.
+
+    It is the first conventional one, or the first of all.
+    """
+    conventional = (k for k, method in enumerate(spec.methods) if method.method == "conventional")
+    return next(conventional, 0)
 
 
 def mean_interval(values: np.ndarray) -> tuple[float, float, float] | None:
@@ -113,14 +122,14 @@ def mean_interval(values: np.ndarray) -> tuple[float, float, float] | None:
 
 
 def _row(
-    spec: Spec, condition: Condition, got: dict[str, np.ndarray], k: int, reference: int | None
+    spec: Spec, condition: Condition, got: dict[str, np.ndarray], k: int, compared: int
 ) -> Row:
     rp, status = got["rp"][k], got["status"][k]
     finite = np.isfinite(rp)
     unknown = (None, None, None)
     mean, difference = mean_interval(rp) or unknown, unknown
-    if reference is not None and k != reference:
-        difference = mean_interval(rp - got["rp"][reference]) or unknown
+    if k != compared:
+        difference = mean_interval(rp - got["rp"][compared]) or unknown
     bound = bound_mm(spec.methods[k], condition)
     return Row(
         method=spec.methods[k].name,
@@ -183,7 +192,8 @@ def as_table(spec: Spec, cells: list[Cell]) -> Table:
     axes = [name for name, values in spec.axes if len(values) > 1]
     for name in axes:
         table.add_column(name.replace("_", " "))
-    for name in ("method", "trials", "mean", "SD", "minus conventional", "not ok"):
+    beside = f"minus {spec.methods[reference(spec)].name}"
+    for name in ("method", "trials", "mean", "SD", beside, "not ok"):
         left = name in ("method", "not ok")
         table.add_column(name, justify="left" if left else "right", overflow="fold")
     for cell in cells:
