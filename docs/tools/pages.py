@@ -208,11 +208,14 @@ def _inside(folder: Path) -> Iterator[None]:
     jax.config.update("jax_enable_x64", False)
     os.chdir(folder)
     os.environ["COLUMNS"] = "100"
+    # As for a reader's script, which imports modules beside it.
+    sys.path.insert(0, str(folder))
     for data in sorted(DATA.glob("*.txt")) + sorted(DATA.glob("*.csv")):
         shutil.copyfile(data, folder / data.name)
     try:
         yield
     finally:
+        sys.path.remove(str(folder))
         jax.config.update("jax_enable_x64", bits)
         os.chdir(before)
         if columns is None:
