@@ -70,6 +70,11 @@ os.environ.pop("JAXCAL_NO_CACHE", None)
 sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
+# Before jaxcal is imported, whose functions it wraps.
+import checked_calls
+
+checked_calls.install()
+
 import gc
 
 import hypothesis
@@ -129,6 +134,12 @@ def _programs_of_one_module():
     gc.collect()
     # What is left stays to the end: no later collection need look through it (0.4 s for a module).
     gc.freeze()
+
+
+@pytest.fixture(autouse=True)
+def _calls_are_checked():
+    """Shapes of the first calls of every function, in every test."""
+    checked_calls.begin_test()
 
 
 @pytest.fixture(scope="session")
