@@ -18,6 +18,7 @@ import numpy as np
 
 from jaxcal import InputError
 from jaxcal.data.problem import Problem, lengthened
+from jaxcal.model.unknowns import MEDIUM
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime import compiler, executables
 from jaxcal.runtime.arrays import first_images, map_arrays
@@ -71,6 +72,7 @@ def _solve_compiled(problem: Problem, given: Given, plan: SolvePlan) -> Calibrat
 
 def _solve_kept(problem: Problem, given: Given, plan: SolvePlan) -> Calibration:
     """Solve one problem by kept programs, which serve several numbers of images."""
+    problem = _as_read(problem, plan)
     padded = lengthened(problem, padded_images(problem.images))
     run = partial(executables.run, flags=compiler.ONE_PROBLEM)
     label = _label(plan, padded.images)
@@ -150,7 +152,7 @@ def _solve_chunks_kept(
     count, images = problems.mask.shape
     chunk = min(bucket(count), largest)
     pieces = -(-count // chunk)
-    padded = problems
+    padded = problems = _as_read(problems, plan)
     if count <= FEW_PROBLEMS:
         # Here a person waits for the compiler; of thousands, masked images would cost run time.
         padded = lengthened(problems, bucket(images))
@@ -170,6 +172,17 @@ def _solve_chunks_kept(
         convert=partial(_kept_as_jax_holds, problem=problems) if done else executables.in_numpy,
     )
     return (result, True) if done else (first_images(result, images), False)
+
+
+def _as_read(problem: Problem, plan: SolvePlan) -> Problem:
+    """The problem without what a solve does not read.
+
+    Otherwise a recording with a probe would need other programs than arrays in memory.
+    """
+    if plan.channels:
+        return problem
+    problem = replace(problem, channels=None)
+    return problem if {*MEDIUM} & {*plan.blocks} else replace(problem, sound_speed=None, delay=None)
 
 
 def _solve_chunks_compiled(
