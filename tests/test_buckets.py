@@ -104,6 +104,8 @@ def same(one: jaxcal.Calibration, other: jaxcal.Calibration, images: int) -> Non
     moved = np.linalg.solve(np.asarray(one.image_to_probe), np.asarray(other.image_to_probe))
     turned = np.array([moved[2, 1], moved[0, 2], moved[1, 0]])
     sd = np.sqrt(np.diagonal(one.covariance))
+    # mm and rad where there are no SDs.
+    np.testing.assert_allclose(np.concatenate([moved[:3, 3], turned]), 0, atol=1e-9)
     if np.isfinite(sd).all():
         assert np.abs(np.concatenate([moved[:3, 3], turned]) / sd).max() < 1e-10
         np.testing.assert_allclose(other.covariance / np.outer(sd, sd),

@@ -55,7 +55,7 @@ REFLECTED = b"-1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"
 
 def bomb(content: bytes) -> bytes:
     """Pixels that inflate to a gigabyte."""
-    packer = zlib.compressobj(9)
+    packer = zlib.compressobj(1)
     packed = b"".join(packer.compress(bytes(1 << 20)) for _ in range(1000)) + packer.flush()
     head = content[: content.index(b"LOCAL\n") + 6]
     head = re.sub(rb"CompressedDataSize = \d+", b"CompressedDataSize = %d" % len(packed), head)

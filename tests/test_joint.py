@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import angle, problem, select
+from conftest import angle, problem
 from scipy.optimize import least_squares, minimize
 
 import jaxcal
@@ -233,4 +233,3 @@ def test_elevation_is_where_the_target_is_in_the_image(single):
     np.testing.assert_allclose(
         result.rms, np.sqrt(float(result.cost) / 30), rtol=1e-12
     )  # Eq. 7's residuals are the in-plane ones
-    assert select(data, np.arange(4)).images == 4

@@ -338,3 +338,9 @@ def test_what_windows_lacks_is_asked_for():
         "hw.runtime.keys": ["tty", "termios", "os.tcgetpgrp", "os.getpgrp"],
         "jaxcal.study.workers": ["select.poll"],
     }
+
+
+def test_figures_leave_pyplot_alone():
+    """It would change the state, and perhaps open windows, of whoever uses the library."""
+    for path in (HOME / "jaxcal").rglob("*.py"):
+        assert "pyplot" not in re.sub(r"#.*|\"\"\"[\s\S]*?\"\"\"", "", path.read_text()), path

@@ -47,7 +47,7 @@ def sequence(tmp_path):
 
     poses = np.tile(np.eye(4), (COUNT, 1, 1))
     poses[:, :3, :3] = Rotation.random(COUNT, random_state=1).as_matrix()
-    poses[:, :3, 3] = RNG.uniform(-100, 100, (COUNT, 3))
+    poses[:, :3, 3] = np.random.default_rng(1).uniform(-100, 100, (COUNT, 3))
     valid = {PAIR: np.arange(COUNT) != 2}
     path = tmp_path / "hard.igs.mha"
     write_sequence(path, {PAIR: poses}, np.arange(COUNT) / 10, valid=valid, images=list(FRAMES))

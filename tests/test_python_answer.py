@@ -499,13 +499,3 @@ for call, *given in (
     assert lines[215] == "mask must be a numpy array, not a list"
     assert lines[219].startswith("pose 0 is a reflection")
     assert lines[69] == "robust must be True or False, not 'no'"
-
-
-def test_drawing_is_not_imported_before_it_is_asked_for():
-    code = (
-        "import sys, jaxcal.calibration.calibrate, jaxcal.report.record; "
-        "heavy = {'matplotlib', 'jaxcal.report.plots', 'jaxcal.report.page'} & set(sys.modules); "
-        "sys.exit(str(heavy) if heavy else 0)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stderr) == (0, "")

@@ -124,11 +124,12 @@ def test_error_follows_contrast(drawn):
 
 def test_a_shape_that_does_not_fit_is_paid_for_in_the_covariance(drawn):
     frames, truth, crossing = drawn("cross", 34.0, True)
-    spot = localise(frames, "echo")
-    used = spot.found & crossing.found
+    half = slice(0, len(frames) // 2)
+    spot = localise(frames[half], "echo")
+    used = spot.found & crossing.found[half]
     assert used.mean() > 0.95
-    assert (spot.residual[used] > crossing.residual[used]).mean() > 0.95
-    error = spot.position[used] - truth[used]
+    assert (spot.residual[used] > crossing.residual[half][used]).mean() > 0.95
+    error = spot.position[used] - truth[half][used]
     assert normalised(error, spot.covariance[used]).mean() < 2.4
 
 

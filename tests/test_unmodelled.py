@@ -74,6 +74,10 @@ def slipped(recording: Recording, parts: np.ndarray | None = None) -> Recording:
     return replace(recording, calibration=make_images(poses, images.measurements))
 
 
+AT_HALF = np.where(np.arange(IMAGES) < IMAGES // 2, 0.0, 0.3)
+"""Parts of a slip that happens in the middle."""
+
+
 def slipped_at_once(recording: Recording) -> Recording:
     """The same at image 31, near the end."""
     return slipped(recording, np.arange(IMAGES) >= 31)
@@ -162,6 +166,18 @@ WORDS = {
 }
 
 
+def rounded(recording: Recording) -> Recording:
+    """In pixels of 0.1 mm, the target is in the middle of one."""
+    return with_points(recording, 0.1 * np.round(recording.calibration.measurements / 0.1))
+
+
+def cut_off(recording: Recording) -> Recording:
+    """The nine deepest points are at one edge."""
+    points = recording.calibration.measurements.copy()
+    points[:, 1] = np.minimum(points[:, 1], np.sort(points[:, 1])[-9])
+    return with_points(recording, points)
+
+
 def two_echoes() -> Recording:
     """A second echo in forty per cent of the images."""
     recording = clean(1)
@@ -182,8 +198,8 @@ def far_from_the_plane() -> Recording:
     return replace(recording, calibration=make_images(poses, points))
 
 
-# Images in use, and seeds: with the faults 128 problems, two chunks of 64.
 CLEAN, SEEDS = (12, 30), range(100, 139)
+"""Images in use, and seeds."""
 
 
 @pytest.fixture(scope="module")
@@ -192,6 +208,9 @@ def answers() -> dict[str, list[tuple[Recording, jaxcal.Calibration]]]:
     sets = [(kind, IMAGES, map(fault, map(clean, range(4)))) for kind, fault in FAULTS.items()]
     sets.append(("echoes", IMAGES, [two_echoes()]))
     sets.append(("far", IMAGES, [far_from_the_plane()]))
+    edges = [cut_off(clean(3)), cut_off(rounded(clean(3))), rounded(clean(3))]
+    sets.append(("cut off", IMAGES, edges))
+    sets.append(("half", IMAGES, [slipped(clean(seed), AT_HALF) for seed in range(4)]))
     sets.append(("neighbours", IMAGES, [neighbours(clean(seed), 2.0) for seed in range(100, 104)]))
     sets += [(f"clean {images}", images, map(moving, map(clean, SEEDS))) for images in CLEAN]
     recordings, problems = {}, []
@@ -264,12 +283,9 @@ def test_a_curved_array_at_another_sound_speed_is_named_where_that_is_estimated(
             assert re.search(r"lateral positions that are too long by [34]\.. %", words)
 
 
-def test_a_mount_that_slips_at_half_is_named_with_its_place():
+def test_a_mount_that_slips_at_half_is_named_with_its_place(answers):
     """A steady slip explains most of it, and was named before."""
-    parts = np.where(np.arange(IMAGES) < IMAGES // 2, 0.0, 0.3)
-    recordings = [slipped(clean(seed), parts) for seed in range(4)]
-    answers = jaxcal.calibrate_batch(recordings).numpy()
-    found = [unmodelled(answers[k])[0] for k in range(len(recordings))]
+    found = [unmodelled(result)[0] for _, result in answers["half"]]
     assert [each.kind for each in found] == ["step"] * len(found)
     assert all(abs(each.image - IMAGES // 2) <= 1 for each in found)
 
@@ -282,7 +298,7 @@ def test_a_prior_that_pulls_the_sound_speed_is_told_of():
         for factor in (1.0, 1.04, 1.1)
         for each in clean
     ]
-    answers = jaxcal.calibrate_batch(recordings, estimate="sound-speed").numpy()
+    answers = jaxcal.calibrate_batch(recordings, prior="gaussian", estimate="sound-speed").numpy()
     told = [
         any("the prior pulls it back" in words for words in answers[k].warnings)
         for k in range(len(recordings))
@@ -339,19 +355,24 @@ def along_a_path(seed: int, alike: float = 0.0) -> Recording:
     return Recording(make_images(poses, seen[:, [0, 2]] + errors))
 
 
-def test_offsets_that_change_slowly_along_a_path_are_no_error_of_the_poses():
+@pytest.fixture(scope="module")
+def found_along_paths() -> tuple[list[list], list[list]]:
+    """What is found along paths whose offsets, and along others whose errors, change slowly."""
     # Of 40, those in which the offsets imitate wrong markers, in 14 a distorted tracker as well.
-    recordings = [along_a_path(seed) for seed in (4, 8, 14, 22, 31)]
-    answers = jaxcal.calibrate_batch(recordings).numpy()
-    found = [unmodelled(answers[k]) for k in range(len(recordings))]
-    assert found == [[]] * len(recordings)
+    slow = [along_a_path(seed) for seed in (4, 8, 14, 22, 31)]
+    alike = [along_a_path(seed, 0.6) for seed in range(12)]
+    answers = jaxcal.calibrate_batch([*slow, *alike]).numpy()
+    found = [unmodelled(answers[k]) for k in range(len(slow) + len(alike))]
+    return found[: len(slow)], found[len(slow) :]
 
 
-def test_errors_alike_in_successive_images_are_no_error_of_the_poses():
+def test_offsets_that_change_slowly_along_a_path_are_no_error_of_the_poses(found_along_paths):
+    assert found_along_paths[0] == [[]] * 5
+
+
+def test_errors_alike_in_successive_images_are_no_error_of_the_poses(found_along_paths):
     """Of 12 such recordings, 9 were told of one."""
-    recordings = [along_a_path(seed, 0.6) for seed in range(12)]
-    answers = jaxcal.calibrate_batch(recordings).numpy()
-    assert sum(bool(unmodelled(answers[k])) for k in range(len(recordings))) <= 2
+    assert sum(map(bool, found_along_paths[1])) <= 2
 
 
 def test_a_fit_of_alike_errors_explains_hardly_more_than_one_of_independent_ones():
@@ -523,26 +544,21 @@ def test_images_left_out_that_agree_among_themselves_are_told_of():
     assert calibration_record(result, wild)["tre"]["left_out"] is None
 
 
-@pytest.mark.parametrize("whole_pixels", [False, True])
-def test_points_cut_off_at_a_depth_are_told_of(whole_pixels):
-    found = clean(3)
-    points = found.calibration.measurements.copy()
-    if whole_pixels:
-        points = np.round(points)
-    assert calibration(with_points(found, points))["tre"]["clipped"] is None
-    limit = np.sort(points[:, 1])[-9]
-    deep = np.flatnonzero(points[:, 1] >= limit)
-    points[:, 1] = np.minimum(points[:, 1], limit)
-    record = calibration(with_points(found, points))
-    edge = record["tre"]["clipped"]
+@pytest.mark.parametrize("whole", [False, True])
+def test_points_cut_off_at_a_depth_are_told_of(answers, whole):
+    recording, result = answers["cut off"][whole]
+    points = recording.calibration.measurements
+    record = calibration_record(result, recording)
+    edge, limit = record["tre"]["clipped"], points[:, 1].max()
     assert (edge["axis"], edge["largest"], edge["value"]) == (1, True, limit)
-    assert edge["images"] == deep.tolist()
+    assert edge["images"] == np.flatnonzero(points[:, 1] == limit).tolist()
     assert record["verdict"] != "good"
-    told = f"{len(deep)} images share the largest range, {limit:.6g} mm"
+    told = f"{len(edge['images'])} images share the largest range, {limit:.6g} mm"
     assert any(told in words for words in record["tre"]["contradictions"])
     # The images that are named hold what was wrong.
     assert edge["apart_mm"] > 0.5 * record["tre"]["stated_mm"]
 
 
-def calibration(recording: Recording) -> dict:
-    return calibration_record(jaxcal.calibrate(recording), recording)
+def test_points_that_are_whole_pixels_are_not_cut_off(answers):
+    for recording, result in [answers["cut off"][2], *answers["clean 30"][:5]]:
+        assert calibration_record(result, recording)["tre"]["clipped"] is None
