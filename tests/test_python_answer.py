@@ -467,7 +467,9 @@ for call, *given in (
     assert lines[16] == "folds must be a whole number, not '4'"
     assert lines[22] == "depth_mm must be nearest, then farthest, not (90, 10)"
     assert lines[27] == "poses must be an array of real numbers"
-    assert lines[29] == "kind must be one of point, pixel, time_of_flight, not 'pixels'"
+    assert (
+        lines[29] == "kind must be one of point (mm), pixel (px), time_of_flight (s), not 'pixels'"
+    )
     assert lines[30] == "measurements must not hold masked entries: leave those rows out (mask=)"
     assert lines[50] == "tolerance_mm must be finite and positive, in mm, not '0.1'"
     assert lines[53] == "max_rounds must be a whole number, not 2.5"

@@ -100,7 +100,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         damping: first lambda, relative to the diagonal.
 
     Raises:
-        InputError: a tolerance, damping or ``atol`` below zero, or one that is no number.
+        InputError: a tolerance or damping below zero, or one that is no number.
     """
 
     rtol: float = 0.0
@@ -110,7 +110,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     damping: float = 1e-3
 
     def __check_init__(self) -> None:
-        given = {"damping": self.damping, "atol": self.atol}
+        given = {"damping": self.damping, "rtol": self.rtol, "atol": self.atol}
         if self.tolerance is not None:
             given["tolerance"] = self.tolerance
         for name, value in given.items():
