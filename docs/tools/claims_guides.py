@@ -69,9 +69,10 @@ claim(
 
 # A mean of the offsets.
 def _off_centre(row: Row) -> list[float]:
-    """Coverage with each mean, %."""
+    """Coverage of X's translation and of TRE with each mean, %."""
     where = {name: row[name] for name in ("sd_mm", "images", "noise_mm")}
-    return percent(column("off_centre", "cover_t_elevational", **where))
+    both = (column("off_centre", of, **where) for of in ("cover_t_elevational", "held_at_points"))
+    return percent(value for pair in zip(*both, strict=True) for value in pair)
 
 
 claim(
@@ -89,8 +90,7 @@ for centred in table("off_centre"):
         claim(
             TRUST,
             f"| {centred['sd_mm']} mm | {number(centred, 'range_sd_mm'):.2f} mm "
-            f"| {centred['images']} "
-            "| {:.0f} | {:.0f} | {:.0f} | {:.0f} | {:.0f} | {:.0f} |",
+            f"| {centred['images']} " + 6 * "| {:.0f} / {:.0f} " + "|",
             lambda row=centred: _off_centre(row),
         )
 
@@ -102,7 +102,7 @@ def _told_of_unit(group: str, *columns: str) -> float:
 
 claim(
     TRUST,
-    "Of {:.0f} simulated recordings with poses in cm, {:.0f} were told of in this way or as wrong "
+    "Of {:.0f} simulated recordings with poses in cm, {:.0f} were reported in this way or as wrong "
     "units; of {:.0f} in mm none was with ordinary probes, and {:.0f} with small probes",
     lambda: (
         _told_of_unit("ordinary probe, cm", "recordings"),
