@@ -1,4 +1,4 @@
-"""Comparison (ii): the same data, best practice. RP of seven ways to calibrate, for five laws.
+"""Comparison (ii): the same data, best practice. Seven ways to calibrate, five distributions.
 
 Each method solves the same simulated experiments; differences from the conventional one are paired,
 with Student's 95 % intervals. The study is alternating_vs_joint.toml; nothing in it is fitted.
@@ -42,7 +42,7 @@ def table(data) -> list[list[object]]:
 
 
 def summary(rows: list[list[object]]) -> list[list[object]]:
-    """For each law and method: how the cells' mean RP compares with conventional's."""
+    """For each distribution and method: how the cells' mean RP compares with conventional's."""
     out: list[list[object]] = []
     keys = dict.fromkeys((row[0], row[3]) for row in rows)
     for law, method in keys:
@@ -78,7 +78,7 @@ def main() -> None:
 
 
 def plot(path: Path, data, rows: list[list[object]]) -> None:
-    """Mean RP over conventional's, with the interval of the paired difference, law by law."""
+    """Mean RP over conventional's, with the interval of the paired difference, by distribution."""
     from matplotlib.figure import Figure
 
     laws = [str(law) for law in data.elevation_distribution.values]

@@ -1,7 +1,7 @@
 """How far prior ``auto`` is from the Bayes limit, the best that anybody can do on average.
 
-The limit is told what nobody knows: the law of the offsets, its size, and the noise (with the
-points' covariances). Its answer is the posterior mean of X in its tangent, sampled
+The limit is told what nobody knows: the distribution of the offsets, its size, and the noise (with
+the points' covariances). Its answer is the posterior mean of X in its tangent, sampled
 (:mod:`bayes_sampler`). That mean is the best answer in squared error; in mean RP, which is a norm,
 it is nearly so, and no more than that.
 
@@ -17,8 +17,8 @@ one more unknown (every logarithm of it as probable), as it is to everybody in f
 The largest ratio of so many cells is large by chance as well. Cells above BOUND are therefore run
 again on AGAIN draws of their own (``bayes_limit_again.csv``).
 
-Seed 20261126; trial k of a cell is fold_in(root, cell * 10^6 + k), cells counted over all laws;
-the second time k begins at 500,000.
+Seed 20261126; trial k of a cell is fold_in(root, cell * 10^6 + k), cells counted over all
+distributions; the second time k begins at 500,000.
 """
 
 from __future__ import annotations
@@ -164,7 +164,7 @@ def again(
 
 
 def ratios(rows: list[list[object]], law: LawName | None, images: int) -> np.ndarray:
-    """Columns elevation, noise, auto_over_bayes, ci95_half of the rows of a law and size."""
+    """Columns elevation, noise, auto_over_bayes, ci95_half of a distribution and size."""
     picked = [row for row in rows if row[1] == images and law in (None, row[0])]
     return np.array([[row[2], row[3], row[9], row[10]] for row in picked], float)
 
@@ -185,7 +185,7 @@ def summary(rows: list[list[object]]) -> None:
 
 
 def plot(path: Path, rows: list[list[object]]) -> None:
-    """Auto over the limit, a panel for each law at 50 images."""
+    """Auto over the limit, a panel for each distribution at 50 images."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 8), layout="constrained")

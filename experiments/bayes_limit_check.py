@@ -18,7 +18,7 @@ import bayes_limit
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import arguments, machine, precision, problems_of, show, write_table
+from common import arguments, machine, precision, problems_of, rms, show, write_table
 from jaxtyping import Array
 
 from jaxcal.backend import RIGID, Parameters, measurement_residual, retract
@@ -135,8 +135,8 @@ def run(condition: int, trials: int, steps: int) -> list[object]:
     tests = experiments.test_poses, experiments.test_points
     rp = [float(precision(x, *tests).mean()) for x in (walked, sampled)]
     return [
-        law, images, trials, steps, float(accepted.mean()), rms(own),
-        float(np.sqrt(np.mean([one.error for one in found]))), rms(apart),
+        law, images, trials, steps, float(accepted.mean()), float(rms(own)),
+        float(np.sqrt(np.mean([one.error for one in found]))), float(rms(apart)),
         float(np.max(np.abs(apart))), *rp,
     ]  # fmt: skip
 
@@ -149,11 +149,6 @@ def tangent_of(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     length = np.linalg.norm(sine)
     angle = np.arcsin(length) / length if length > 0 else 1.0
     return np.concatenate([x[:3, :3].T @ (y[:3, 3] - x[:3, 3]), angle * sine])
-
-
-def rms(values: np.ndarray) -> float:
-    """Root mean square."""
-    return float(np.sqrt(np.mean(values**2)))
 
 
 def main() -> None:

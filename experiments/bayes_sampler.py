@@ -1,4 +1,4 @@
-"""Posterior means of X when the offsets' law and the noise are told, by importance sampling.
+"""Posterior means of X by importance sampling; the offsets' distribution and noise are known.
 
 The posterior of X and the target c is exact and nonlinear,
 
@@ -30,7 +30,7 @@ ENOUGH, MOST_BLOCKS = 400.0, 24
 TAIL = 10.0
 """Degrees of freedom of the draws: heavier tails than the posterior's keep the weights bounded."""
 STEEPNESS = 30.0
-"""While the proposal adapts, laws fall beyond an edge by this many e-foldings within one size."""
+"""While the proposal adapts, densities fall beyond an edge by this many e-foldings in a size."""
 
 
 def log_law(law: LawName, u: Float[np.ndarray, "n draws"]) -> Float[np.ndarray, " draws"]:
@@ -72,9 +72,9 @@ class Target:
 
     Attributes:
         law: of the offsets.
-        size: of the law, mm.
+        size: of the distribution, mm.
         position: q_i at the origin, mm.
-        told: the size is told; otherwise (uniform law only) it is one more unknown.
+        told: the size is told; otherwise (uniform distribution only) it is one more unknown.
         turn: how c moves q_i there.
         points: lateral position and range, mm.
         whitening: lower triangular inverse root of every covariance.
@@ -171,11 +171,11 @@ def posterior_mean(
 
     Args:
         law: of the offsets.
-        size: of the law, mm.
+        size: of the distribution, mm.
         data: poses (n, 4, 4), points (n, 2), covariances (n, 2, 2), mm.
         start: X and c near the solution.
         random: a generator.
-        told: the size is told; otherwise it is only where the search begins (uniform law).
+        told: the size is told; otherwise it is only where the search begins (uniform distribution).
     """
     x, c = (np.array(value) for value in start)
     sd = size * standard_deviation(law)

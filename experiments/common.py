@@ -27,6 +27,7 @@ from jaxcal.study.simulation import NUMBERS, Experiment
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
 # The scripts' own arrays; jaxcal computes in 64 bits anyway.
@@ -39,7 +40,12 @@ NOISES_MM = (0.0, 0.5, 2.0, 4.0, 6.0, 8.0, 10.0)
 """The grid of the paper's Tables 1 and 2."""
 
 LAWS: tuple[LawName, ...] = ("uniform", "normal", "one-sided", "heavy-tailed", "triangular")
-"""Of the offsets, in most experiments."""
+"""Distributions of the offsets in most experiments."""
+
+POINTS_MM = np.stack(
+    np.meshgrid(np.linspace(-20, 20, 5), np.linspace(20, 80, 4), indexing="ij"), axis=-1
+).reshape(-1, 2)
+"""Lateral positions and depths at which stated and actual errors are compared."""
 
 
 def arguments(description: str | None) -> tuple[bool, Path]:
@@ -71,6 +77,23 @@ def write_rows(path: Path, rows: Sequence[Mapping[str, object]]) -> None:
     write_table(path, rows[0], [row.values() for row in rows])
 
 
+def read_rows(path: Path) -> list[dict[str, Any]]:
+    """What :func:`write_rows` wrote, numbers as such: to draw a figure again without its script."""
+    with path.open(newline="") as stream:
+        return [
+            {name: _number(cell) for name, cell in row.items()} for row in csv.DictReader(stream)
+        ]
+
+
+def _number(cell: str) -> float | str:
+    for kind in (int, float):
+        try:
+            return kind(cell)
+        except ValueError:
+            continue
+    return cell
+
+
 def show(row: Iterable[object]) -> None:
     """Print a row with short numbers."""
     print(*(f"{v:.4g}" if isinstance(v, float) else v for v in row), sep=", ", flush=True)
@@ -80,6 +103,12 @@ def save_figure(figure: Figure, path: Path, dpi: int) -> None:
     """Write a figure whole or not at all."""
     with atomic_path(path) as temporary:
         figure.savefig(temporary, dpi=dpi)
+
+
+def plain_ticks(axis: Axis, values: Sequence[float]) -> None:
+    """Mark these values in plain numbers, as an axis with a logarithmic scale does not."""
+    axis.set_ticks(list(values), [f"{value:g}" for value in values])
+    axis.set_minor_formatter("")
 
 
 def grid_panel(panel: Axes, grid: Float[np.ndarray, "elevations noises"], half: float) -> None:
@@ -159,11 +188,30 @@ def right_errors(
     return np.concatenate([shift, turn], axis=1)
 
 
+def point_errors(
+    estimate: Float[np.ndarray, "t 4 4"], truth: Float[np.ndarray, "t 4 4"]
+) -> Float[np.ndarray, "t points"]:
+    """How far the points of :data:`POINTS_MM` are off, mm."""
+    lateral, depth = POINTS_MM.T
+    there = np.stack([lateral, 0 * lateral, depth, np.ones(len(POINTS_MM))])
+    return np.linalg.norm(((estimate - truth) @ there)[:, :3], axis=1)
+
+
+def rms(values: np.ndarray, axis: int | None = None):
+    """Root mean square of what is known, along an axis or of all."""
+    return np.sqrt(np.nanmean(np.square(values), axis=axis))
+
+
+def half_95(values: np.ndarray) -> float:
+    """Half the 95 % interval of the mean of independent values."""
+    return float(1.96 * values.std(ddof=1) / np.sqrt(len(values)))
+
+
 def paired_ratio(values: np.ndarray, to: np.ndarray) -> tuple[float, float]:
     """Ratio of the means of paired trials, and half its 95 % interval (linearised)."""
     quotient = float(values.mean() / to.mean())
     apart = values - quotient * to
-    return quotient, float(1.96 * apart.std(ddof=1) / np.sqrt(len(to)) / to.mean())
+    return quotient, half_95(apart) / float(to.mean())
 
 
 def batch_of(
@@ -195,7 +243,7 @@ def batch_of(
 
 
 def machine() -> str:
-    """Processor, cores and versions, for a table's foot."""
+    """Processor, cores and versions, printed at the end of a run."""
     model = platform.processor() or platform.machine()
     for line in Path("/proc/cpuinfo").read_text().splitlines() if os.name == "posix" else ():
         if line.startswith("model name"):

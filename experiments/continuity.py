@@ -5,7 +5,8 @@ from hardly believed to believed:
 
 - ``mean``: offsets of mean zero become one-sided ones;
 - ``own covariances``: the images' own covariances go from another image's to their own;
-- ``outlier``: one image's point moves away by 3 mm, beyond the edges of every law that has some.
+- ``outlier``: one image's point moves away by 3 mm, beyond the edges of every distribution that has
+  some.
 
 Each path is looked at in 41 places; where X moves fastest, in SDs, 41 places a thousandth of the
 path apart follow. The table has the largest step between such neighbours, in SDs of the answer, of

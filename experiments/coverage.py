@@ -18,9 +18,11 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 from common import (
+    POINTS_MM,
     arguments,
     experiments,
     machine,
+    point_errors,
     problems_of,
     right_errors,
     save_figure,
@@ -41,21 +43,11 @@ SIZES_MM = ((2.0, 2.0), (1.0, 0.5), (5.0, 2.0))
 ASKED = {50: (0.92, 0.98), 12: (0.90, 0.98)}
 """Coverage asked for, by the number of images."""
 TRE_WITHIN = 0.1
-POINTS_MM = np.stack(
-    np.meshgrid(np.linspace(-20, 20, 5), np.linspace(20, 80, 4), indexing="ij"), axis=-1
-)
 HEADER = [
     "elevation_distribution", "images", "elevation_mm", "noise_mm", "trials",
     *(f"cover_{axis}" for axis in AXES),
     "tre_actual_mm", "tre_predicted_mm", "predicted_over_actual", "not_converged",
 ]  # fmt: skip
-
-
-def distances(estimate: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """How far the image points are off, mm (trials, points)."""
-    points = POINTS_MM.reshape(-1, 2)
-    there = np.stack([points[:, 0], 0 * points[:, 0], points[:, 1], np.ones(len(points))])
-    return np.linalg.norm(((estimate - truth) @ there)[:, :3], axis=1)
 
 
 def main() -> None:
@@ -77,8 +69,8 @@ def main() -> None:
             cover = np.abs(right_errors(found, truth)) <= transform_intervals(result)
             predicted = np.asarray(predicted_tre(result, POINTS_MM))
             # An answer that is not observable has no interval, and states no error.
-            known = np.isfinite(predicted).all(axis=(1, 2))
-            actual = float(np.sqrt(np.mean(distances(found, truth)[known] ** 2)))
+            known = np.isfinite(predicted).all(axis=1)
+            actual = float(np.sqrt(np.mean(point_errors(found, truth)[known] ** 2)))
             told = float(np.sqrt(np.mean(predicted[known] ** 2)))
             row = [law, images, elevation, noise, trials, *map(float, cover.mean(axis=0)), actual,
                    told, told / actual, int(np.sum(~np.asarray(result.converged)))]  # fmt: skip
@@ -124,12 +116,14 @@ def plot(path: Path, rows: list[list[object]]) -> None:
         kind = {"t": "translation", "r": "rotation"}[axis[0]]
         upper.plot(column[f"cover_{axis}"], "o", label=f"{kind}, {axis[2:]}", markersize=4)
     for k, row in enumerate(rows):
-        upper.fill_between([k - 0.5, k + 0.5], *ASKED[int(str(row[1]))], color="0.9")
+        upper.fill_between([k - 0.5, k + 0.5], *ASKED[int(str(row[1]))], color="0.9",
+                           label=None if k else "asked for")  # fmt: skip
     upper.axhline(0.95, color="black", linewidth=0.8)
     upper.set(ylabel="coverage of 95 % intervals", ylim=(0.85, 1))
-    upper.legend(fontsize="x-small", ncols=6)
+    upper.legend(fontsize="x-small", ncols=7)
     lower.plot(column["predicted_over_actual"], "o")
-    lower.axhspan(1 - TRE_WITHIN, 1 + TRE_WITHIN, color="0.9")
+    lower.axhspan(1 - TRE_WITHIN, 1 + TRE_WITHIN, color="0.9", label="within 10 %")
+    lower.legend(fontsize="x-small")
     lower.axhline(1, color="black", linewidth=0.8)
     lower.set(
         ylabel="predicted over actual TRE",

@@ -24,6 +24,7 @@ import numpy as np
 from common import (
     arguments,
     experiments,
+    half_95,
     machine,
     precision,
     save_figure,
@@ -119,7 +120,7 @@ def main() -> None:
         got = run_cell(cell, bound, noise, trials)
         mean = {name: float(got[name].mean()) for name in ("conventional", "paper", "joint")}
         paired = got["joint"] - got["conventional"]
-        half = float(1.96 * paired.std(ddof=1) / np.sqrt(trials))
+        half = half_95(paired)
         ratio = mean["joint"] / mean["conventional"]
         ratios[BOUNDS_MM.index(bound), NOISES_MM.index(noise)] = ratio
         signs, failures = float(got["sign"][0]), int((~got["converged"]).sum())

@@ -12,11 +12,14 @@ different pose and, of a sweep, every so many (:mod:`jaxcal.calibration.dependen
 covariance for errors that are alike in successive images
 (:mod:`jaxcal.calibration.serial_correlation`).
 
-The table has the coverage of the 95 % intervals of X's six parameters (the mean and the lowest),
-the root mean square errors of X and what was stated, the share of trials that would be called good
-or fair, by the stated target registration error, although the truth is outside the 99 % interval of
-some parameter, and how many were refused for having fewer than four different poses. Of 400 trials
-(a quarter of them with every frame an image) a share is known to +- 2 %.
+The table has the coverage of the 95 % intervals of X's six parameters (the mean, the lowest and the
+highest), the root mean square errors of X and what was stated, and how many were refused for having
+fewer than four different poses. ``good`` is the share of trials whose stated target registration
+error alone would make them good, ``good_outside_99`` that of trials that would be good although the
+truth is outside the 99 % interval of some parameter; ``fair_outside_99`` those that would be fair.
+A share of 400 trials is known to +- 5 % at worst (95 %), one of 100 to +- 10 %. Every frame as an
+image takes long: 100 trials show what comes of it, and a row of its own has ``jaxcal.calibrate`` on
+the same trials. On these, ``verdict_...`` count the words of the real verdict (holds and sweeps).
 
 Seed 20261122; trial t of condition k has the generator (seed, k, t).
 """
@@ -27,7 +30,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields
 
 import numpy as np
-from common import arguments, batch_of, machine, right_errors, write_table
+from common import arguments, batch_of, machine, right_errors, rms, show, write_rows
 from scipy.spatial.transform import Rotation
 
 import jaxcal
@@ -44,11 +47,15 @@ OFFSET_MM = 1.0
 QUIET_MM = np.array([0.12, 0.06])
 """The SDs in smooth sweeps."""
 RATE_HZ = 20
-HEADER = [
-    "condition", "frames_as", "trials", "refused", "not_converged", "images_mean",
-    "cover_95_mean", "cover_95_lowest", "cover_95_highest", "error_mm", "stated_mm", "error_deg",
-    "stated_deg", "good", "good_outside_99", "fair_outside_99",
+SAME = "calibrate, same trials"
+"""In the table's second column: by ``jaxcal.calibrate``, of the trials of "every frame" only."""
+MEASURED = [
+    "not_converged", "images_mean", "cover_95_mean", "cover_95_lowest", "cover_95_highest",
+    "error_mm", "stated_mm", "error_deg", "stated_deg", "good", "good_outside_99",
+    "fair_outside_99", "verdict_good", "verdict_fair", "verdict_good_outside_99",
+    "verdict_fair_outside_99",
 ]  # fmt: skip
+"""Columns of :func:`row_of`."""
 
 
 @dataclass(frozen=True)
@@ -198,8 +205,7 @@ def stated_tre(results: Calibration) -> np.ndarray:
     """Root mean square target registration error over the image, by which answers are judged."""
     lateral, axial = np.meshgrid(np.linspace(-25, 25, 5), np.linspace(15, 85, 5))
     points = np.stack([lateral, axial], axis=-1).reshape(-1, 2)
-    found = np.asarray(jaxcal.predicted_tre(results, points))
-    return np.sqrt(np.mean(found**2, axis=-1))
+    return rms(np.asarray(jaxcal.predicted_tre(results, points)), axis=-1)
 
 
 @dataclass(frozen=True)
@@ -227,8 +233,11 @@ class Answers:
         return cls(*(np.asarray(each)[None] if alone else np.asarray(each) for each in whole))
 
 
-def row_of(answers: list[Answers], truth: np.ndarray) -> list[object]:
-    """What the table says of some answers."""
+def row_of(answers: list[Answers], truth: np.ndarray, words: list[str]) -> dict[str, object]:
+    """What the table says of some answers, and of their verdicts if these are known."""
+    row: dict[str, object] = dict.fromkeys(MEASURED, "")
+    if not answers:
+        return row
     joined = {
         field.name: np.concatenate([getattr(each, field.name) for each in answers])
         for field in fields(Answers)
@@ -240,45 +249,58 @@ def row_of(answers: list[Answers], truth: np.ndarray) -> list[object]:
     variance, worst = joined["variance"][converged], joined["tre"][converged]
     stated = np.sqrt(variance.reshape(-1, 2, 3).sum(axis=2)) * [1.0, np.degrees(1.0)]
     actual = np.sqrt((error.reshape(-1, 2, 3) ** 2).sum(axis=2)) * [1.0, np.degrees(1.0)]
-    error_mm, error_deg = np.sqrt(np.mean(actual**2, axis=0))
-    stated_mm, stated_deg = np.sqrt(np.mean(stated**2, axis=0))
     covered = inside.mean(axis=0)
-    return [
-        int((~converged).sum()), float(np.mean(joined["images"])),
-        float(covered.mean()), float(covered.min()), float(covered.max()),
-        float(error_mm), float(stated_mm), float(error_deg), float(stated_deg),
-        float(np.mean(worst <= GOOD_MM)), float(np.mean((worst <= GOOD_MM) & outside)),
-        float(np.mean((worst > GOOD_MM) & (worst <= FAIR_MM) & outside)),
-    ]  # fmt: skip
+    fair = (worst > GOOD_MM) & (worst <= FAIR_MM)
+    row |= {"not_converged": int((~converged).sum()),
+            "images_mean": float(np.mean(joined["images"])),
+            "cover_95_mean": float(covered.mean()), "cover_95_lowest": float(covered.min()),
+            "cover_95_highest": float(covered.max())}  # fmt: skip
+    for name, values in (("error", actual), ("stated", stated)):
+        row[f"{name}_mm"], row[f"{name}_deg"] = map(float, rms(values, axis=0))
+    row |= {"good": float(np.mean(worst <= GOOD_MM)),
+            "good_outside_99": float(np.mean((worst <= GOOD_MM) & outside)),
+            "fair_outside_99": float(np.mean(fair & outside))}  # fmt: skip
+    if words:
+        said = np.array(words)[converged]
+        for word in ("good", "fair"):
+            row[f"verdict_{word}"] = float(np.mean(said == word))
+            row[f"verdict_{word}_outside_99"] = float(np.mean((said == word) & outside))
+    return row
 
 
 def main() -> None:
     quick, folder = arguments(__doc__)
     trials = 40 if quick else 400
     enable_compilation_cache()
-    rows: list[list[object]] = []
+    rows: list[dict[str, object]] = []
     for condition, (name, make) in enumerate(CONDITIONS.items()):
         sets = [make(np.random.default_rng([SEED, condition, t])) for t in range(trials)]
-        # Every frame as an image takes longest, and a quarter of the trials shows what comes of it.
-        some = sets[: trials // 4]
-        every = batch_of([(one.poses, one.points) for one in some], len(some[0].poses))
-        found = {"every frame": [Answers.of(jaxcal.calibrate_batch(every, chunk=40))]}
-        found["calibrate"], answered = [], []
-        for one in sets:
+        some = trials // 4
+        every = batch_of([(one.poses, one.points) for one in sets[:some]], len(sets[0].poses))
+        answers: list[Answers | None] = []
+        words: list[str] = []
+        for trial, one in enumerate(sets):
             try:
                 result = jaxcal.calibrate(jaxcal.Problem.from_arrays(one.poses, one.points))
             except jaxcal.InputError:
+                answers.append(None)
                 continue
-            found["calibrate"].append(Answers.of(result))
-            answered.append(one)
-        for (how, answers), those in zip(found.items(), (some, answered), strict=True):
-            tried = len(sets) if how == "calibrate" else len(some)
-            rest: list[object] = [""] * (len(HEADER) - 4)
-            if answers:
-                rest = row_of(answers, np.array([one.image_to_probe for one in those]))
-            rows.append([name, how, tried, tried - len(those), *rest])
-            print(*rows[-1], flush=True)
-    write_table(folder / "dependent_frames.csv", HEADER, rows)
+            answers.append(Answers.of(result))
+            if trial < some and ("holds" in name or "sweep" in name):
+                words.append(result.record()["verdict"] or "none")
+        truth = np.array([one.image_to_probe for one in sets])
+        batch = [Answers.of(jaxcal.calibrate_batch(every, chunk=40))]
+        everything = {"condition": name, "frames_as": "every frame", "trials": some, "refused": 0}
+        rows.append(everything | row_of(batch, truth[:some], []))
+        for how, tried, said in ((SAME, some, words), ("calibrate", trials, [])):
+            answered = np.array([each is not None for each in answers[:tried]])
+            found = [each for each in answers[:tried] if each is not None]
+            row = {"condition": name, "frames_as": how, "trials": tried}
+            row |= {"refused": tried - len(found)}
+            rows.append(row | row_of(found, truth[:tried][answered], said))
+        for row in rows[-3:]:
+            show(row.values())
+    write_rows(folder / "dependent_frames.csv", rows)
     print(machine())
 
 

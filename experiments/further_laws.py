@@ -1,9 +1,9 @@
-"""Prior ``auto`` on laws of the offsets that differ from those which it weighs.
+"""Prior ``auto`` on distributions of the offsets that differ from those which it weighs.
 
 Exponential, two-humped, drifting, outlying and off-centre offsets (:mod:`jaxcal.study.offsets`) for
-8, 20 and 50 images and five pairs of size and noise, and the five laws of ``auto_grid`` for 8
-images. On the same draws: conventional calibration, the paper's alternation (1 mm), prior ``auto``
-from points with covariances (``auto``) and from points alone (``auto_points``).
+8, 20 and 50 images and five pairs of size and noise, and the five distributions of ``auto_grid``
+for 8 images. On the same draws: conventional calibration, the paper's alternation (1 mm), prior
+``auto`` from points with covariances (``auto``) and from points alone (``auto_points``).
 
 A cell in which a ratio that should be at most 1 is not is run again on ten times as many fresh
 draws (``further_laws_again.csv``): a cell picked for being the worst of many says little alone.
@@ -32,7 +32,7 @@ SIZES = (8, 20, 50)
 
 
 def cells(quick: bool) -> list[Cell]:
-    """Further laws for all numbers of images, the others for the smallest."""
+    """Further distributions for all numbers of images, the others for the smallest."""
     sizes = SUBSET[1:3] if quick else SUBSET
     return [
         Cell(law, images, *size)

@@ -6,10 +6,10 @@ mrad. Points: 0.3 mm, independent or alike in successive images (correlation 0.6
 intervals of 1 s, 0.9 s and 0.2 s and show what was earlier by the lag. Poses are interpolated at
 the stamps of the images, as ``jaxcal import --poses`` does.
 
-For each: in which share a lag is told of at the import (:func:`jaxcal.data.timing.fitted_lag`) and
+For each: in which share a lag is reported at the import (:func:`jaxcal.data.timing.fitted_lag`) and
 by the verdict of the calibration with the default prior, the root mean square errors of both
 estimates where they are told, in which share a recording is refused (fewer than four poses differ)
-or another fault is told of, in which the verdict is good or fair, in which it is so
+or another fault is reported, in which the verdict is good or fair, in which it is so
 although the actual error exceeds the end of its 95 % interval, and the median of the actual error.
 The last columns are of calibrations in which the lag of the import was stated.
 
@@ -153,7 +153,7 @@ class Trial:
 def calibrated(
     trials: list[Trial], recordings: list[Recording]
 ) -> tuple[list[float | None], np.ndarray]:
-    """The lag of each verdict; and: refused, another kind told of, good or fair, wrong, error."""
+    """The lag of each verdict; and: refused, another kind reported, good or fair, wrong, error."""
     lags: list[float | None] = []
     rows: list[list[float]] = []
     for trial, recording in zip(trials, recordings, strict=True):
@@ -186,11 +186,12 @@ def figure(rows: list[list[object]], path) -> None:
 
     drawn = Figure(figsize=(9.0, 3.0), layout="constrained")
     panels = drawn.subplots(1, len(TIMES), sharey=True)
-    shown = (("told_at_import", "told at the import"), ("told_by_verdict", "told by the verdict"),
-             ("good_or_fair", "verdict good or fair"))  # fmt: skip
+    shown = (("told_at_import", "named at the import"), ("told_by_verdict", "named by the verdict"),
+             ("good_or_fair", "verdict good or fair"),
+             ("other_told", "verdict names another error"))  # fmt: skip
     for panel, (images, every_s) in zip(panels, TIMES, strict=True):
         of = [row for row in rows if row[:3] == [images, every_s, 0.0]]
-        for (column, label), style in zip(shown, ("o-", "s-", "^--"), strict=True):
+        for (column, label), style in zip(shown, ("o-", "s-", "^--", "x:"), strict=True):
             shares = [row[HEADER.index(column)] for row in of]
             panel.plot([1000 * lag for lag in LAGS_S], shares, style, label=label)
         panel.set_title(f"{images} images, one every {every_s:g} s", fontsize=9)

@@ -1,7 +1,7 @@
 """Gross outliers: the robust solve against an oracle that knows which images are spoilt.
 
-A tenth and three tenths of the images are spoilt by 20 to 100 mm (``contamination``:
-wrong echo, wrong click, wrong pose, slipped mount), for three laws of the offsets and five cells of
+A tenth and three tenths of the images are spoilt by 20 to 100 mm (``contamination``: wrong echo,
+wrong click, wrong pose, slipped mount), for three distributions of the offsets and five cells of
 the paper's grid at n = 50; each kind by itself, and 12, 20 and 200 images, in the middle cell. Mean
 reconstruction precision of the robust solve (prior auto, points alone), of the same solve with the
 spoilt images masked, and of the solve that does nothing about them; the share of the spoilt images
@@ -183,9 +183,10 @@ def plot(path, rows: list[list]) -> None:
         panels, (LARGEST_RATIO, LEAST_NAMED, MOST_FALSE),
         ("mean RP over the oracle's", "outliers named", "clean images named"), strict=True,
     ):  # fmt: skip
-        panel.axhline(bar, color="grey", linewidth=0.8)
+        panel.axhline(bar, color="grey", linewidth=0.8, label="limit asked for")
         panel.set_ylabel(label)
-    panels[0].legend(ncols=3, fontsize="x-small")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=4,
+                  fontsize="x-small")  # fmt: skip
     panels[-1].set_xticks(range(len(names)), names)
     panels[-1].set_xlabel(
         "elevational size, noise (mm), n = 50; and 2, 2 at other numbers of images"

@@ -3,7 +3,7 @@
 Planned poses of the wide cone (:mod:`pose_design`) of which none, a tenth, a fifth (the default) or
 two fifths fill space, and random poses. Uniform offsets of SD 1 mm, prior ``auto``. Ranges are
 right, or too long by 1 mm 20 mm to the side, by the square of the lateral position. The table has
-the root mean square TRE of X, the share of the recordings in which something is told of, and the
+the root mean square TRE of X, the share of the recordings in which something is reported, and the
 share in which the verdict is good or fair although the error at the image exceeds the end of its
 95 % interval. Of 400 trials a share is known to +- 2.5 % or better.
 

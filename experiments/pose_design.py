@@ -1,9 +1,9 @@
 """Which poses: errors against the number of images for random, Sobol and planned poses.
 
 A linear probe (L14-5) sees the target within 24 mm either way and 15 to 82 mm deep. Elevational
-offsets follow one of five laws of SD 1 mm, every element's distance errs by 0.5 mm (SD), so lateral
-position and range by what Eq. 5 makes of it at that place. The probe tilts within a cone of 40
-degrees and turns by 90 (wide), or tilts and turns by 10 (narrow). Poses:
+offsets follow one of five distributions of SD 1 mm, every element's distance errs by 0.5 mm (SD),
+so lateral position and range by what Eq. 5 makes of it at that place. The probe tilts within a cone
+of 40 degrees and turns by 90 (wide), or tilts and turns by 10 (narrow). Poses:
 
 - random: drawn anew for each trial; Sobol: the first n of the sequence, with a seed for each trial;
 - optimal: ``jaxcal.design.plan`` for the TRE, which takes the SDs for uncertain by a factor of 3;
@@ -17,7 +17,7 @@ test images of random poses within the same limits. *predicted* is the root mean
 calibration's own covariance predicts, *planned* what the plan promised before any image. Standard
 errors are in the table.
 
-Seed 20261129; 2,000 trials a cell (``--quick``: 24, of two laws).
+Seed 20261129; 2,000 trials a cell (``--quick``: 24, of two distributions).
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from common import (
     arguments,
     batch_of,
     machine,
+    plain_ticks,
     save_figure,
     show,
     write_table,
@@ -248,8 +249,16 @@ def verdict(rows: list[list[object]]) -> list[str]:
     return said
 
 
+SHOWN = {
+    "random": "random", "sobol": "Sobol", "optimal": "planned",
+    "wrong+": "planned, elevational SD assumed 3 times too large",
+    "wrong-": "planned, elevational SD assumed 3 times too small", "replanned": "re-planned",
+}  # fmt: skip
+"""Names of the arms in the figure."""
+
+
 def plot(path: Path, rows: list[list[object]]) -> None:
-    """TRE and RP against the number of images, mean over the laws."""
+    """TRE and RP against the number of images, mean over the distributions."""
     from matplotlib.figure import Figure
 
     shown = [dict(zip(HEADER, row, strict=True)) for row in rows]
@@ -271,12 +280,13 @@ def plot(path: Path, rows: list[list[object]]) -> None:
                         means.append(np.sqrt(np.mean(np.square(some))) if some else np.nan)
                     if np.isfinite(means).any() and not (method != "auto" and "wrong" in arm):
                         panel.loglog(COUNTS, means, style, color=colour, markersize=4,
-                                     label=f"{arm}, {method}")  # fmt: skip
-            panel.set(title=f"{cone} cone", xlabel="images", ylabel=name.replace("_", " ("))
-            panel.set_ylabel(f"{name[:-3].upper()} (mm)")
-            panel.set_xticks(COUNTS, [str(count) for count in COUNTS])
+                                     label=f"{SHOWN[arm]}, {method}")  # fmt: skip
+            panel.set(title=f"{cone} cone", xlabel="images", ylabel=f"{name[:-3].upper()} (mm)")
+            plain_ticks(panel.xaxis, COUNTS)
+            plain_ticks(panel.yaxis, (0.1, 0.2, 0.5, 1, 2) if down == 0 else (0.1, 0.2, 0.5, 1))
             panel.grid(alpha=0.3, which="both")
-    panels[0, 0].legend(fontsize="x-small")
+    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3,
+                  fontsize="small")  # fmt: skip
     save_figure(figure, path, dpi=130)
 
 

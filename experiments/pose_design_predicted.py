@@ -1,9 +1,9 @@
 """Is the TRE that is predicted before any image the actual one?
 
 Actual TRE of ``auto`` at planned and random poses (those of pose_design.py, with draws of their
-own) against two predictions made before any image: that of simulated recordings under the law
-(``design.simulate_errors``) and that of the plan, which knows the SDs only (the root mean square
-over the sets for random poses). 4,000 recordings each (``--quick``: 24). Seed 20261129.
+own) against two predictions made before any image: that of simulated recordings under the
+distribution (``design.simulate_errors``) and that of the plan, which knows the SDs only (the root
+mean square over the sets for random poses). 4,000 recordings each (``--quick``: 24). Seed 20261129.
 """
 
 from __future__ import annotations

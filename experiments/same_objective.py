@@ -302,7 +302,8 @@ def plot(path, costs: np.ndarray, joint_cost: np.ndarray, iterations: np.ndarray
     axes.set(xlabel="rounds (alternation), iterations (joint)",
              ylabel="objective above the joint optimum (relative)",
              title="Same objective, same start, n = 50")  # fmt: skip
-    axes.legend()
+    # Beside the axes: the curves go from corner to corner.
+    figure.legend(loc="outside lower center", ncols=2, fontsize="small")
     axes.grid(alpha=0.3)
     save_figure(figure, path, dpi=150)
 

@@ -61,7 +61,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import arguments, machine, problems_of, save_figure, write_table
+from common import arguments, half_95, machine, problems_of, save_figure, write_table
 from jaxtyping import Float
 
 from jaxcal import Problem, Protocol, calibrate_batch, reconstruction_precision, simulate
@@ -225,7 +225,7 @@ def run_elevation(elevation: float, trials: int, seen: dict[float, np.ndarray]) 
 
 def interval(values: np.ndarray) -> tuple[float, float]:
     """Mean and half of its 95 % interval."""
-    return float(values.mean()), float(1.96 * values.std(ddof=1) / np.sqrt(len(values)))
+    return float(values.mean()), half_95(values)
 
 
 def verdict(mean: float, half: float) -> str:

@@ -19,6 +19,7 @@ from common import (
     arguments,
     experiments,
     grid_panel,
+    half_95,
     machine,
     precision,
     problems_of,
@@ -73,7 +74,7 @@ def main() -> None:
         got = run_cell(cell, elevation, noise, trials)
         mean = {name: float(got[name].mean()) for name in ("conventional", "alternating", "joint")}
         paired = got["joint"] - got["conventional"]
-        half = float(1.96 * paired.std(ddof=1) / np.sqrt(trials))
+        half = half_95(paired)
         # A component without error has nothing to be compared with.
         truth = got["realised"]
         true = truth.mean(axis=0)

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 import numpy as np
-from common import arguments, experiments, machine, show, write_table
+from common import arguments, experiments, machine, rms, show, write_table
 
 import jaxcal
 from jaxcal.data.recording import Recording, make_images
@@ -58,10 +58,9 @@ def judged(result, gaussian, recording: Recording, x: np.ndarray) -> list[float]
     return [error, other, tre["stated_mm"], tre["rms_mm"], told, good, wrong, stated]
 
 
-def rms(values: np.ndarray) -> float | None:
+def known_rms(values: np.ndarray) -> float | None:
     """Root mean square of the known values; None if none is known."""
-    known = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(known**2))) if known.size else None
+    return float(rms(values)) if np.isfinite(values).any() else None
 
 
 def main() -> None:
@@ -90,7 +89,7 @@ def main() -> None:
                 found = np.array(
                     [judged(results[k], others[k], recordings[k], x[k]) for k in range(trials)]
                 )
-                rows.append([law, images, limits, bound, trials, *map(rms, found[:, :4].T)])
+                rows.append([law, images, limits, bound, trials, *map(known_rms, found[:, :4].T)])
                 rows[-1] += map(float, found[:, 4:].mean(axis=0))
                 show(rows[-1])
     write_table(folder / "sharp_limits.csv", HEADER, rows)

@@ -1,7 +1,7 @@
-"""Errors that the model leaves out: how often are they told of, and what becomes of the verdict?
+"""Errors that the model leaves out: how often are they reported, and what becomes of the verdict?
 
-Simulated recordings (uniform offsets of SD 1 mm, noise level 1) without any fault and with one of
-twelve, calibrated with the default prior:
+Simulated recordings (uniform offsets to 1 mm, of SD 0.58 mm; noise level 1) without any fault and
+with one of twelve, calibrated with the default prior:
 
 - ``scale``: ranges 4 % too long (a sound speed of 1540 m/s in water of 1480 m/s);
 - ``skew``: lateral positions off by 3 % of the depth;
@@ -20,8 +20,8 @@ twelve, calibrated with the default prior:
   turned by 1.2 degrees and moved by 1 mm (a sphere that is hidden or in a wrong place);
 - ``displaced``: the target moves by 2 mm, in any direction, before the last quarter of the images.
 
-For each: the share in which something is told of (a kind of error that the model leaves out, or
-two groups), in which it is the right thing, in which two targets are told of, in which the verdict
+For each: the share in which something is reported (a kind of error that the model leaves out, or
+two groups), in which it is the right thing, in which two targets are reported, in which the verdict
 is good or fair, and in which it is so although the actual error at the image exceeds the end of its
 95 % interval. The same of the interval that the covariance states by itself:
 ``stated_good_and_wrong``.
@@ -73,7 +73,7 @@ class Judged(NamedTuple):
     """What one calibration says, or in which share of them it is said.
 
     Attributes:
-        told_of: something is told of.
+        told_of: something is reported.
         right: it is the right thing.
         two_targets: it is two targets.
         good_or_fair: the verdict is.
@@ -200,7 +200,7 @@ def judged(
     fault: str,
     truly: Callable[[np.ndarray], np.ndarray],
 ) -> Judged:
-    """What is told of, and what the verdict is worth, for one calibration."""
+    """What is reported, and what the verdict is worth, for one calibration."""
     record = calibration_record(result, recording)
     if record["wrong_frames"]:
         # It names the scale, and the record states no error.

@@ -1,7 +1,7 @@
 """Errors that the model leaves out, where every element's time of flight is fitted.
 
-As :mod:`unmodelled`, on times of flight (each distance with an SD of 0.5 mm, uniform offsets of
-SD 1 mm) of a curved array, and of a straight one whose sound speed is estimated. The faults:
+As :mod:`unmodelled`, on times of flight (each distance with an SD of 0.5 mm, uniform offsets to
+1 mm) of a curved array, and of a straight one whose sound speed is estimated. The faults:
 
 - ``speed``: all distances 3 % too long (a sound speed of 1540 m/s in water of 1495 m/s), of the
   curved array, whose sound speed is not estimated;

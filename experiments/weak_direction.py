@@ -16,7 +16,7 @@ along this direction is integrated over in place of being maximised:
 *Steps.* The same paths as in ``continuity.py`` (12 images, towards a mean of the offsets, and an
 image that moves away), at the same 41 places, a thousandth of the path apart: all on which the
 default steps by more than a tenth of an SD, and 100 others. The integral takes the offsets to be
-Gaussian with mean zero; the default weighs their laws.
+Gaussian with mean zero; the default weighs their distributions.
 
 *Error.* Simulated recordings with 8, 12 and 20 images: median and mean target registration error in
 the middle of the image of REML's maximum (prior ``gaussian``) and of the integral.
