@@ -124,6 +124,10 @@ def auto() -> list[float]:
 
 LAWS = ("uniform", "normal", "one-sided", "heavy-tailed", "triangular")
 AUTO, BAYES = "auto_over_conventional", "auto_over_bayes"
+AUTO_POINTS = "auto_points_over_conventional"
+BY_GAUSSIAN = "auto_points_over_gaussian_points"
+PLACED = ("amplitude scan", "pattern injection", "threshold climb", "free hand")
+"""Placements in the mid-plane; the last is not by robot."""
 
 
 def bayes(images: str) -> list[float]:
@@ -142,9 +146,24 @@ def worst_spoilt(kind: str | None = None) -> Row:
     return max(rows, key=lambda row: number(row, "robust_over_oracle"))
 
 
-def placed(name: str) -> float:
-    """Precision of the joint calibration after this placement."""
-    return only("placement", "rp_joint_mm", placement=name)
+def significant(name: str, ratio: str, **where: str) -> tuple[int, int]:
+    """In how many rows a ratio is significantly below 1, and in how many above."""
+    values, halves = (column(name, of, **where) for of in (ratio, f"{ratio}_ci95_half"))
+    both = list(zip(values, halves, strict=True))
+    return sum(v + half < 1 for v, half in both), sum(v - half > 1 for v, half in both)
+
+
+def placed(name: str, method: str = "joint") -> float:
+    """Precision of the calibration after this placement."""
+    return only("placement", f"rp_{method}_mm", placement=name)
+
+
+def tank_compared() -> tuple[int, int, int]:
+    """Joint against conventional in the tank: significantly worse, of how many, and better."""
+    name, of = "paper_experiment_sensitivity", "joint_over_without_exact"
+    both = list(zip(column(name, f"{of}_percent"), column(name, f"{of}_half"), strict=True))
+    worse, better = (sum(sign * v > half for v, half in both) for sign in (1, -1))
+    return worse, len(both), better
 
 
 def cells(protocol: str) -> list[object]:
@@ -153,13 +172,22 @@ def cells(protocol: str) -> list[object]:
     return [int(row[k]) for row in rows for k in ("within_1_sd", "cells")]
 
 
-FITTED = "fitted: test 0.55, 2 rounds"
+FITTED, UNFITTED = "fitted: test 0.55, 2 rounds", "unfitted: test 1.0, at rest"
+
+
+def fitted() -> list[Row]:
+    """Cells of the fitted protocol."""
+    return [row for row in table("paper_tables") if row["protocol"] == FITTED]
 
 
 def unmatched() -> list[Row]:
     """Cells of the fitted protocol that are not within the paper's one SD."""
-    fitted = [row for row in table("paper_tables") if row["protocol"] == FITTED]
-    return [row for row in fitted if row["within_1_sd"] == "False"]
+    return [row for row in fitted() if row["within_1_sd"] == "False"]
+
+
+def within(sds: str, protocol: str) -> int:
+    """How many cells of a protocol are within the paper's ``1`` or ``half`` SD."""
+    return int(sum(column("paper_tables_verdict", f"within_{sds}_sd", protocol=protocol)))
 
 
 def poses(cone: str, images: str) -> list[float]:

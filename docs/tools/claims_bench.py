@@ -174,7 +174,7 @@ claim(
 )
 claim(
     ACCURACY,
-    "Of recordings without an error {:.1f} to {:.1f} % are told of one.",
+    "In {:.1f} to {:.1f} % of the recordings without an error one is reported.",
     lambda: percent(span(column("plan_faults", "told_of", curve_mm="0"))),
 )
 claim(
