@@ -61,6 +61,32 @@ def moving(
         yield motion
 
 
+def put_in_order(robot: EmulatedRobot) -> EmulatedRobot:
+    """End every fault, and set at the pendant what the plan says; a program is left to itself.
+
+    A test calls it itself, since one in real time may run again with the same robot.
+    """
+    robot.ask("unmute")
+    robot.ask("mute control", False)
+    robot.ask("freeze", False)
+    robot.ask("stamps", 1000.0, 1.0)
+    robot.ask("overspeed", 1.0)
+    robot.ask("dashboard", None)
+    robot.ask("remote", True)
+    robot.ask("robot_state", 7, 1)
+    robot.ask("payload", 0.0)
+    robot.ask("speed_slider", 1.0)
+    robot.ask("tcp_offset", OFFSET)
+    robot.ask("force", [0.0] * 6)
+    return robot
+
+
+def farther(robot: EmulatedRobot) -> np.ndarray:
+    """The one of two poses of the plan, 50 mm apart, that the arm is farther from."""
+    x = robot.state()["raw"][0] * 1000.0
+    return max(PLAN.targets[0], PLAN.targets[2], key=lambda pose: abs(x - pose[0, 3]))
+
+
 def only_asked(state: dict) -> bool:
     """Whether the dashboard was only asked, or told to stop the program: no power, no unlocking."""
     asked = {"PolyscopeVersion", "get serial number", "get robot model", "is in remote control"}

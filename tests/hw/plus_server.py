@@ -1,9 +1,11 @@
 """An emulated PlusServer in a process of its own: a hand that holds a probe over a point.
 
-    python plus_server.py '{"mode": "tracked", "poses": 8}'
+    python plus_server.py
 
-prints its port as one JSON line, streams to whoever connects, and ends with its standard input. The
-stamps of the stream run faster than the clock on the wall, so that a test does not take minutes.
+takes what to serve as lines of JSON, e.g. ``{"asked": {"mode": "tracked", "poses": 8}}``, and
+answers each with its port, as ``{"port": 40000}``; there it streams to whoever connects, one client
+after the other. It ends with its standard input. The stamps of a stream run faster than the clock
+on the wall, so that a test does not take minutes.
 """
 
 from __future__ import annotations
@@ -68,10 +70,6 @@ def frame(rng: np.random.Generator, pixel: np.ndarray | None) -> np.ndarray:
     return np.clip(255 * (decibels + 20) / 60, 0, 255).astype(np.uint8)
 
 
-seen = 0
-"""The count of the pose whose frames the person has seen last."""
-
-
 def stream(asked: dict):
     """(stamp, frame, transforms) for ever: hold, travel, hold, ...
 
@@ -79,7 +77,8 @@ def stream(asked: dict):
         asked: ``poses``: how many there are; ``seed``; ``first``: the pose to begin at; ``order``:
             poses in the order in which they are held; ``lost``: poses at which the probe is out of
             view; ``hidden``: poses at which nothing is in the image; ``led``: hold each pose until
-            the person who sees its frames, whose first pixel counts the poses, has said so.
+            the person who sees its frames, whose first pixel counts the poses, has said so;
+            ``seen``: the count that was said last.
     """
     rng = np.random.default_rng(7)
     poses, pixels = holds(asked.get("poses", 9), asked.get("seed", 1))
@@ -89,7 +88,7 @@ def stream(asked: dict):
     reference[:3, :3] = Rotation.from_rotvec([0.1, 0.2, -0.3]).as_matrix()
     reference[:3, 3] = [-300.0, 100.0, -1500.0]
     stamp = START_S + asked.get("seed", 1)
-    count = seen
+    count = asked.get("seen", 0)
     while True:
         for step, index in enumerate(order):
             count += 1
@@ -99,7 +98,7 @@ def stream(asked: dict):
             following = poses[order[(step + 1) % len(order)]]
             number = -1
             while number < HOLD + TRAVEL - 1:
-                if number != HOLD - 1 or not asked.get("led") or seen >= count:
+                if number != HOLD - 1 or not asked.get("led") or asked.get("seen", 0) >= count:
                     number += 1
                 stamp += PERIOD_S
                 # A hand is never quite at rest, and a head rests on the reference.
@@ -161,14 +160,19 @@ def messages(asked: dict):
         yield b"".join(parts)
 
 
-def main(asked: dict) -> None:
-    """Serve one client after the other until standard input ends, whose lines are poses seen."""
-    global seen
-    listener = socket.create_server(("127.0.0.1", asked.get("port", 0)))
-    print(json.dumps({"port": listener.getsockname()[1]}), flush=True)
-    threading.Thread(target=serve, args=(listener, asked), daemon=True).start()
+def main() -> None:
+    """Serve what is asked for until standard input ends, and take the poses that were seen."""
+    served = {}
     for line in sys.stdin:
-        seen = int(line)
+        told = json.loads(line)
+        if "seen" in told:
+            served[told["port"]]["seen"] = told["seen"]
+            continue
+        listener = socket.create_server(("127.0.0.1", 0))
+        port = listener.getsockname()[1]
+        served[port] = told["asked"]
+        threading.Thread(target=serve, args=(listener, served[port]), daemon=True).start()
+        print(json.dumps({"port": port}), flush=True)
 
 
 def serve(listener: socket.socket, asked: dict) -> None:
@@ -186,4 +190,4 @@ def serve(listener: socket.socket, asked: dict) -> None:
 
 
 if __name__ == "__main__":
-    main(json.loads(sys.argv[1]))
+    main()

@@ -577,6 +577,14 @@ def test_what_ends_a_run_is_recorded_whatever_it_is(e_series, tmp_path):
         assert file["events/text"][-1] == b"BrokenPipeError: [Errno 32] Broken pipe"
 
 
+def named(process: Path, argument: Path) -> bool:
+    """Whether a process was started with an argument; one that has ended meanwhile was not."""
+    try:
+        return os.fsencode(argument) in (process / "cmdline").read_bytes().split(b"\0")
+    except OSError:
+        return False
+
+
 def test_a_disk_that_fails_as_well_does_not_hide_why_the_robot_was_stopped(e_series, tmp_path):
     path = tmp_path / "rec.h5"
 
@@ -585,7 +593,7 @@ def test_a_disk_that_fails_as_well_does_not_hide_why_the_robot_was_stopped(e_ser
             (writer,) = (
                 int(process.name)
                 for process in Path("/proc").glob("[0-9]*")
-                if os.fsencode(path) in (process / "cmdline").read_bytes().split(b"\0")
+                if named(process, path)
             )
             resource.prlimit(writer, resource.RLIMIT_FSIZE, (1000, 1000))
             raise StoppedError("protective stop", device="robot")

@@ -13,7 +13,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Collection, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -54,46 +54,45 @@ from jaxcal.io.openigtlink import Message, encode
 SERVER = Path(__file__).with_name("plus_server.py")
 
 
-PlusServer = Callable[..., int]
-"""Starts a server of what is asked for; its port."""
+class PlusServer:
+    """Serves what is asked for; its hand holds still for a moment, so it has its own process."""
+
+    def __init__(self, process: subprocess.Popen) -> None:
+        self._process = process
+
+    def __call__(self, **asked) -> int:
+        """The port at which it is served."""
+        self._tell(asked=asked)
+        assert self._process.stdout is not None
+        return json.loads(self._process.stdout.readline())["port"]
+
+    def seen(self, port: int, count: int) -> None:
+        """The frames of one more pose were seen."""
+        self._tell(port=port, seen=count)
+
+    def _tell(self, **told: object) -> None:
+        print(json.dumps(told), file=self._process.stdin, flush=True)
 
 
-def started(processes: ExitStack, **asked) -> tuple[subprocess.Popen, int]:
-    """A server and its port; it has a process of its own: its hand holds still for a moment."""
-    process = subprocess.Popen(
-        [sys.executable, str(SERVER), json.dumps(asked)],
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    processes.enter_context(process)
-    processes.callback(process.kill)
-    assert process.stdout is not None
-    return process, json.loads(process.stdout.readline())["port"]
-
-
-@contextmanager
-def starting() -> Iterator[PlusServer]:
-    with ExitStack() as processes:
-        yield lambda **asked: started(processes, **asked)[1]
-
-
-@pytest.fixture
+@pytest.fixture(scope="module")
 def plus_server() -> Iterator[PlusServer]:
-    with starting() as start:
-        yield start
+    with subprocess.Popen(
+        [sys.executable, str(SERVER)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+        yield PlusServer(process)
+        process.kill()
 
 
 @pytest.fixture(scope="module")
-def separate() -> Iterator[int]:
+def separate(plus_server) -> int:
     """Port of a server of separate messages, which begins anew for every client."""
-    with starting() as start:
-        yield start(mode="separate")
+    return plus_server(mode="separate")
 
 
 @pytest.fixture(scope="module")
-def tracked() -> Iterator[int]:
+def tracked(plus_server) -> int:
     """The same of tracked frames: five images of it give a calibration that is uncertain."""
-    with starting() as start:
-        yield start(mode="tracked", order=[0, 1, 2, 3, 4])
+    return plus_server(mode="tracked", order=[0, 1, 2, 3, 4])
 
 
 class Scripted:
@@ -128,15 +127,15 @@ class Scripted:
 class Leading(Scripted):
     """Leads the hand to its next pose once something was said of the images of this one."""
 
-    def __init__(self, server: subprocess.Popen, **presses: str) -> None:
+    def __init__(self, server: PlusServer, port: int, **presses: str) -> None:
         super().__init__(**presses)
-        self._server, self._seen = server, 0
+        self._server, self._port, self._seen = server, port, 0
 
     def show(self, frame: np.ndarray, words: str, advice: str) -> None:
         super().show(frame, words, advice)
         if not words.startswith(("moving", "hold still")) and frame[0, 0] != self._seen:
-            self._seen = frame[0, 0]
-            print(self._seen, file=self._server.stdin, flush=True)
+            self._seen = int(frame[0, 0])
+            self._server.seen(self._port, self._seen)
 
 
 def check(path: Path, wanted: int, *, among: Collection[int] = range(9), count: int = 9) -> None:
@@ -209,16 +208,13 @@ def test_images_and_transforms_apart(tmp_path, separate):
     assert jaxcal.load(tmp_path / "r.h5").pose_frames == ("Probe", "Reference")
 
 
-def test_what_is_not_taken_is_said(tmp_path):
+def test_what_is_not_taken_is_said(tmp_path, plus_server):
     """Out of view, nothing credible, and a pose that was there before; u takes an image back."""
     order = [0, 1, 2, 1, 3, 4, 5, 6]
-    with ExitStack() as processes:
-        server, port = started(
-            processes, mode="separate", led=True, order=order, lost=[3], hidden=[4]
-        )
-        person = Leading(server, image_2="u")
-        asked = FreeHand("127.0.0.1", port, images=5)
-        assert acquire_free_hand(tmp_path / "r.h5", asked, person) == 5
+    port = plus_server(mode="separate", led=True, order=order, lost=[3], hidden=[4])
+    person = Leading(plus_server, port, image_2="u")
+    asked = FreeHand("127.0.0.1", port, images=5)
+    assert acquire_free_hand(tmp_path / "r.h5", asked, person) == 5
     assert "not tracked: ProbeToTracker is not tracked" in person.words
     assert any(words.startswith("no credible target: nothing stands out") for words in person.words)
     assert any(words.startswith("as in image #") for words in person.words)
@@ -375,7 +371,7 @@ def test_a_servers_clock_that_is_set_back_is_no_end(tmp_path, plus_server):
 def test_a_machine_that_is_frozen_has_no_image_taken(tmp_path, plus_server):
     """Its screen is grabbed with new time stamps: one target's pixel was taken at every pose."""
     person = Scripted()
-    port = plus_server(mode="tracked", frozen=[30, 110])
+    port = plus_server(mode="tracked", frozen=[30, 230])
     assert acquire_free_hand(tmp_path / "r.h5", FreeHand("127.0.0.1", port, images=5), person) == 5
     assert "the image stays the same while the probe moves: is the machine frozen?" in person.words
     check(tmp_path / "r.h5", 5)

@@ -147,7 +147,8 @@ def test_a_person_before_a_window_finds_the_mid_plane():
     figure = Figure(dpi=30)
     canvas = FigureCanvasAgg(figure)
     window = WindowOperator(figure)
-    keys = iter(sweep_then_middle())
+    # The same sweep by steps twice as large: each draws the window anew.
+    keys = iter(["pagedown", "pagedown", "+", *["up"] * 15, "m", "enter"])
 
     def press(key: str) -> None:
         canvas.callbacks.process("key_press_event", KeyEvent("key_press_event", canvas, key))

@@ -111,19 +111,17 @@ def test_bad_scenes_are_refused():
 
 def test_preview_is_a_figure(tmp_path):
     path = tmp_path / "plan.png"
-    plan = plan_poses(6, SCENE)
-    preview(plan, path)
-    without = path.read_bytes()
-    assert without.startswith(b"\x89PNG")
+    preview(plan_poses(6, SCENE), path)
+    assert path.read_bytes().startswith(b"\x89PNG")
     assert (imread(path)[[0, -1]] == 1).all()  # no title is cut off
-    preview(plan, path, np.array([[180.0, -420.0, 40.0], [520.0, -80.0, 270.0]]))
-    assert path.read_bytes() != without
+    box = np.array([[180.0, -420.0, 40.0], [520.0, -80.0, 270.0]])
     # SVG keeps what is written as comments: poses from 1, as the run counts them, and no half ones.
-    preview(plan_poses(4, SCENE), tmp_path / "plan.svg")
+    preview(plan_poses(4, SCENE), tmp_path / "plan.svg", box)
     shown = re.findall("<!-- (.*?) -->", (tmp_path / "plan.svg").read_text())
     bar = shown.index("pose, in the order of the plan")
     assert shown[bar - 4 : bar] == ["1", "2", "3", "4"]
     assert "depth (mm)" in shown
+    assert "box for the probe" in shown
 
 
 def test_what_the_placement_noted_is_told_with_the_image():

@@ -18,6 +18,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from motions import put_in_order
 from robots import CB_SERIES, E_SERIES, START, EmulatedRobot, address
 
 from hw.bench.arm import Arm
@@ -28,6 +29,13 @@ from hw.robot.stream import PoseSample, PoseStream, average
 from hw.runtime.clock import Clock, Lag
 from hw.runtime.errors import LostError, RefusedError, StaleError
 from hw.runtime.rigid import ur_to_pose
+
+
+@pytest.fixture(scope="module")
+def robots() -> Iterator[dict[str, EmulatedRobot]]:
+    """One of each series, for tests that put it in order first; nothing moves it."""
+    with EmulatedRobot(version=CB_SERIES) as old, EmulatedRobot(version=E_SERIES) as new:
+        yield {"CB": old, "e": new}
 
 
 @pytest.mark.real_time
@@ -65,8 +73,9 @@ def again_and_again(
 
 
 @pytest.mark.real_time
-def test_identity_and_tcp_offset():
-    with EmulatedRobot() as robot, PoseStream(robot.host, clock=robot.clock) as poses:
+def test_identity_and_tcp_offset(robots):
+    robot = put_in_order(robots["e"])
+    with PoseStream(robot.host, clock=robot.clock) as poses:
         identity = poses.identity()
         assert (identity.serial, identity.model) == ("20195500042", "UR5")
         assert identity.version == "5.11.0.108249"
@@ -74,10 +83,8 @@ def test_identity_and_tcp_offset():
         robot.ask("tcp_offset", [0.0, 0.0, 0.101, 0.0, 0.0, 0.0])
         with pytest.raises(RefusedError, match="TCP offset changed"):
             again_and_again(poses.latest)
-    with (
-        EmulatedRobot(version=CB_SERIES) as robot,
-        PoseStream(robot.host, clock=robot.clock) as poses,
-    ):
+    robot = put_in_order(robots["CB"])
+    with PoseStream(robot.host, clock=robot.clock) as poses:
         identity = poses.identity()
         assert (identity.serial, identity.version) == ("20195500042", "3.15.8.106339")
         assert identity.identified
@@ -106,8 +113,9 @@ def test_an_arm_is_known_by_its_serial_number_and_calibration(version, serial, c
     assert ("@" in first.name) != first.identified
 
 
-def test_payload_and_speed_slider_are_told():
-    with EmulatedRobot() as robot, PoseStream(robot.host, clock=robot.clock) as poses:
+def test_payload_and_speed_slider_are_told(robots):
+    robot = put_in_order(robots["e"])
+    with PoseStream(robot.host, clock=robot.clock) as poses:
         assert poses.pendant == PendantSettings(0.0, (0.0, 0.0, 0.0), 1.0)
         robot.ask("payload", 0.8, (0.0, 0.0, 0.05))
         robot.ask("speed_slider", 0.5)
@@ -127,39 +135,35 @@ def test_payload_and_speed_slider_are_told():
 
 
 @pytest.mark.real_time
-def test_a_mute_controller_makes_poses_stale_and_then_lost():
-    with EmulatedRobot() as robot:
-        with PoseStream(robot.host, clock=robot.clock, timeout_s=2.0) as poses:
+def test_a_mute_controller_makes_poses_stale_and_then_lost(robots):
+    robot = put_in_order(robots["e"])
+    with PoseStream(robot.host, clock=robot.clock, timeout_s=2.0) as poses:
+        poses.latest()
+        robot.ask("mute")
+        time.sleep(0.15)
+        with pytest.raises(StaleError, match=r"ms old: it came \d{3,} ms ago .* at most 100 ms"):
             poses.latest()
-            robot.ask("mute")
-            time.sleep(0.15)
-            with pytest.raises(
-                StaleError, match=r"ms old: it came \d{3,} ms ago .* at most 100 ms"
-            ):
-                poses.latest()
-            with pytest.raises((StaleError, LostError)):
-                poses.steady(0.1)
-            with pytest.raises(LostError, match=r"silent for 2 s"):
-                again_and_again(poses.latest, after=StaleError)
-            assert poses.drain()[-1].raw == pytest.approx(START)
-            with pytest.raises(LostError):
-                poses.awaited()
-        start = time.monotonic()
-        with pytest.raises(LostError, match="does not answer"):
-            PoseStream(robot.host, clock=robot.clock, timeout_s=0.5).start()
-        with pytest.raises(LostError, match="dashboard"):
-            read_identity(robot.host, timeout_s=0.5)
-        # A second, and what it takes to start an interpreter.
-        assert time.monotonic() - start < 120.0
+        with pytest.raises((StaleError, LostError)):
+            poses.steady(0.1)
+        with pytest.raises(LostError, match=r"silent for 2 s"):
+            again_and_again(poses.latest, after=StaleError)
+        assert poses.drain()[-1].raw == pytest.approx(START)
+        with pytest.raises(LostError):
+            poses.awaited()
+    start = time.monotonic()
+    with pytest.raises(LostError, match="does not answer"):
+        PoseStream(robot.host, clock=robot.clock, timeout_s=0.5).start()
+    with pytest.raises(LostError, match="dashboard"):
+        read_identity(robot.host, timeout_s=0.5)
+    # A second, and what it takes to start an interpreter.
+    assert time.monotonic() - start < 120.0
 
 
 @pytest.mark.real_time
-def test_a_robot_at_rest_may_be_silent_for_a_moment():
+def test_a_robot_at_rest_may_be_silent_for_a_moment(robots):
     """A machine busy for a tenth of a second ended an acquisition in which nothing moved."""
-    with (
-        EmulatedRobot() as robot,
-        PoseStream(robot.host, clock=robot.clock, timeout_s=60.0) as poses,
-    ):
+    robot = put_in_order(robots["e"])
+    with PoseStream(robot.host, clock=robot.clock, timeout_s=60.0) as poses:
         robot.ask("mute")
         time.sleep(0.3)
         with pytest.raises(StaleError):
@@ -172,8 +176,9 @@ def test_a_robot_at_rest_may_be_silent_for_a_moment():
 
 
 @pytest.mark.real_time
-def test_a_dropped_connection_is_lost_at_once():
-    with EmulatedRobot() as robot, PoseStream(robot.host, clock=robot.clock) as poses:
+def test_a_dropped_connection_is_lost_at_once(robots):
+    robot = put_in_order(robots["e"])
+    with PoseStream(robot.host, clock=robot.clock) as poses:
         robot.ask("drop")
         with pytest.raises(LostError, match="connection"):
             again_and_again(poses.latest)
@@ -184,8 +189,9 @@ def test_nobody_there():
         PoseStream("127.250.250.1", timeout_s=0.5).start()
 
 
-def test_an_average_that_is_interrupted_keeps_no_poses():
-    with EmulatedRobot() as robot, PoseStream(robot.host, clock=robot.clock) as poses:
+def test_an_average_that_is_interrupted_keeps_no_poses(robots):
+    robot = put_in_order(robots["e"])
+    with PoseStream(robot.host, clock=robot.clock) as poses:
         threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
         with pytest.raises(KeyboardInterrupt):
             poses.steady(1e3)
@@ -193,8 +199,9 @@ def test_an_average_that_is_interrupted_keeps_no_poses():
 
 
 @pytest.mark.real_time
-def test_averages_of_steady_poses():
-    with EmulatedRobot() as robot, PoseStream(robot.host, clock=robot.clock) as poses:
+def test_averages_of_steady_poses(robots):
+    robot = put_in_order(robots["e"])
+    with PoseStream(robot.host, clock=robot.clock) as poses:
         poses.drain()
         steady = poses.steady(0.1)
         assert steady.count >= 5
@@ -241,25 +248,25 @@ def look_on(poses: PoseStream) -> None:
         time.sleep(0.01)
 
 
-def test_time_stamps_that_step_or_run_fast_make_no_pose_fresh():
+def test_time_stamps_that_step_or_run_fast_make_no_pose_fresh(robots):
     """A clock that gains on the host's hides any lag, so that a late pose passed as new."""
     late, unknown = "on its way for up to", "of unknown age: the controller's clock"
     ahead = Lag(10.0, 1000.0)
     assert [ahead.of(t, 990.0 + t * (1 + 150e-6)) for t in (10.0, 1000.0)] == [0.0, 0.0]
     assert ahead.of(1000.1, 2000.0) == ahead.of(1001.0, 1991.0) == math.inf
-    with EmulatedRobot(version=CB_SERIES) as robot:
-        for stamps, text in (
-            ((1005.0, 1.0), unknown),
-            ((1000.0, 1000.0), unknown),
-            ((995.0, 1.0), late),
-            ((0.0, 1.0), late),
-        ):
-            robot.ask("stamps", 1000.0, 1.0)
-            with PoseStream(robot.host, clock=robot.clock, max_age_s=3.0) as poses:
-                poses.latest()
-                robot.ask("stamps", *stamps)
-                with pytest.raises(StaleError, match=text):
-                    look_on(poses)
+    robot = put_in_order(robots["CB"])
+    for stamps, text in (
+        ((1005.0, 1.0), unknown),
+        ((1000.0, 1000.0), unknown),
+        ((995.0, 1.0), late),
+        ((0.0, 1.0), late),
+    ):
+        robot.ask("stamps", 1000.0, 1.0)
+        with PoseStream(robot.host, clock=robot.clock, max_age_s=3.0) as poses:
+            poses.latest()
+            robot.ask("stamps", *stamps)
+            with pytest.raises(StaleError, match=text):
+                look_on(poses)
 
 
 @contextmanager
@@ -301,35 +308,35 @@ def delaying(host: str, port: int, seconds: Callable[[bytes], float]) -> Iterato
 
 
 @pytest.mark.real_time
-def test_poses_that_come_late_are_not_new():
+def test_poses_that_come_late_are_not_new(robots):
     delay = [0.15]
 
     def hold(data: bytes) -> float:
         """Requests to start, their answers, and packets; nothing else is measured."""
         return delay[0] if data[2:3] in (b"S", b"U") else 0.0
 
-    with EmulatedRobot(version=CB_SERIES) as robot:
-        with PoseStream(robot.host, clock=robot.clock) as prompt:
-            prompt.latest()
-        with delaying(robot.host, 30004, hold) as host:
-            # Twice the delay, and what a busy machine adds.
-            too_late = r"on their way for ([2-9]\d\d|\d{4,}) ms, over the limit of 100"
-            with pytest.raises(LostError, match=too_late):
-                PoseStream(host, clock=robot.clock, timeout_s=60.0).start()
-            delay[0] = 0.0
-            with PoseStream(host, clock=robot.clock) as late:
-                delay[0] = 0.15
-                time.sleep(0.3)
-                with pytest.raises(StaleError, match=r"was on its way for up to \d{3,} ms"):
-                    late.latest()
-            # Below the limit, a latency that was there from the start counts in every pose's age.
-            delay[0] = 0.05
-            with PoseStream(host, clock=robot.clock, max_age_s=60.0) as slow:
-                assert min(sample.lag_s for sample in slow.drain()) > 0.04
+    robot = put_in_order(robots["CB"])
+    with PoseStream(robot.host, clock=robot.clock) as prompt:
+        prompt.latest()
+    with delaying(robot.host, 30004, hold) as host:
+        # Twice the delay, and what a busy machine adds.
+        too_late = r"on their way for ([2-9]\d\d|\d{4,}) ms, over the limit of 100"
+        with pytest.raises(LostError, match=too_late):
+            PoseStream(host, clock=robot.clock, timeout_s=60.0).start()
+        delay[0] = 0.0
+        with PoseStream(host, clock=robot.clock) as late:
+            delay[0] = 0.15
+            time.sleep(0.3)
+            with pytest.raises(StaleError, match=r"was on its way for up to \d{3,} ms"):
+                late.latest()
+        # Below the limit, a latency that was there from the start counts in every pose's age.
+        delay[0] = 0.05
+        with PoseStream(host, clock=robot.clock, max_age_s=60.0) as slow:
+            assert min(sample.lag_s for sample in slow.drain()) > 0.04
 
 
 @pytest.mark.real_time
-def test_one_slow_start_does_not_make_every_later_pose_look_old():
+def test_one_slow_start_does_not_make_every_later_pose_look_old(robots):
     starts = []
 
     def hold(data: bytes) -> float:
@@ -337,10 +344,8 @@ def test_one_slow_start_does_not_make_every_later_pose_look_old():
         starts.append(data == rtde(b"S", b""))
         return 0.6 if starts[-1] and sum(starts) == 1 else 0.0
 
-    with (
-        EmulatedRobot(version=CB_SERIES) as robot,
-        delaying(robot.host, 30004, hold) as host,
-    ):
+    robot = put_in_order(robots["CB"])
+    with delaying(robot.host, 30004, hold) as host:
         with contextlib.closing(PacketReader(host)) as reader:
             assert sum(starts) >= 2
             assert reader.latency_s < 0.3
@@ -393,7 +398,8 @@ TYPES = b"\x01" + b",".join(
         ([rtde(b"V", b"\x01"), VERSION, rtde(b"O", b"\x01NOT_FOUND,DOUBLE")], "has no"),
         ([rtde(b"V", b"\x01"), VERSION, rtde(b"O", b"")], "has no"),
         ([rtde(b"V", b"\x01"), VERSION, rtde(b"O", TYPES), rtde(b"S", b"\x00")], "start sending"),
-        ([b"GET / HTTP/1.1\r\n\r\n" * 4000], r"no RTDE data|does not answer"),
+        # The start of a long message of another kind.
+        ([b"GET / HTTP/1.1\r\n\r\n" * 4000], "accepted but does not answer"),
     ],
 )
 def test_what_is_no_controller_is_refused(messages, text):
@@ -408,18 +414,19 @@ def packet(pose: tuple[float, ...]) -> bytes:
 
 
 @pytest.mark.parametrize(
-    "payload",
+    ("payload", "text"),
     [
-        b"\x01" + b"\0" * 8,
-        b"\x01" + b"\xff" * 304,
-        packet((0.0, 0.0, 0.0, 1e200, 0.0, 0.0)),
-        packet((1e4, 0.0, 0.0, 0.0, 0.0, 0.0)),
+        (b"\x01" + b"\0" * 8, "a packet of 9 bytes came instead of 305"),
+        (b"\x01" + b"\xff" * 304, "holds NaN or Inf"),
+        (packet((0.0, math.inf, 0.0, 0.0, 0.0, 0.0)), "holds NaN or Inf"),
+        (packet((0.0, 0.0, 0.0, 1e200, 0.0, 0.0)), "holds an impossible pose"),
+        (packet((1e4, 0.0, 0.0, 0.0, 0.0, 0.0)), "holds an impossible pose"),
     ],
 )
-def test_packets_that_do_not_fit_the_recipe_end_the_connection(payload):
+def test_packets_that_do_not_fit_the_recipe_end_the_connection(payload, text):
     opening = [rtde(b"V", b"\x01"), VERSION, rtde(b"O", TYPES), rtde(b"S", b"\x01")]
     host = answers(*opening[:-1], opening[-1] + rtde(b"M", b"text") + rtde(b"U", payload))
-    with pytest.raises(LostError, match=r"bytes came instead|NaN|impossible pose"):
+    with pytest.raises(LostError, match=text):
         PacketReader(host, timeout_s=30.0)
 
 
