@@ -177,7 +177,7 @@ def test_images_that_are_as_noisy_as_their_covariances_say_are_no_outliers():
     assert not np.asarray(found.outlier).any()
     points[7, 0] += 5.0
     wrong = replace(data, measurements=jnp.asarray(points), covariance=covariance)
-    found = jaxcal.calibrate(wrong)
+    found = jaxcal.calibrate(wrong, prior="gaussian")
     assert np.flatnonzero(np.asarray(found.outlier)).tolist() == [7]
 
 

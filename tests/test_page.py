@@ -122,6 +122,7 @@ def test_small_errors_are_not_zero_and_estimates_are_told(record, result, record
     found = {"sound_speed_m_s": 1490.43, "sound_speed_sd_m_s": 0.86,
              "delay_s": -2.14e-8, "delay_sd_s": None,
              "image_unknowns": [*record["image_unknowns"], "delay_mm"],
+             "covariance": (0.04 * np.eye(6)).tolist(),
              "image_covariance": (0.04 * np.eye(7)).tolist()}  # fmt: skip
     text = page({**record, **found, "tre": tre}, result, recording)
     assert ">0.0039</span>" in text
