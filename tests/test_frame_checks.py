@@ -20,6 +20,7 @@ from jaxcal.data.poses import inverse_poses
 from jaxcal.data.recording import make_images
 from jaxcal.diagnostics.frame_checks import doubtful_unit, wrong_frames
 from jaxcal.diagnostics.warnings import warnings
+from jaxcal.diagnostics.wrong_angles import ORDERS, angles_about_axes, composed, vectors_of
 from jaxcal.io.text import read_crosswire
 from jaxcal.report.next_poses import next_poses_record
 from jaxcal.report.record import calibration_record
@@ -60,6 +61,25 @@ def test_every_slip_is_named_or_refused_and_no_right_file_is(slips, form):
                 assert said is not None, (slip, number)
                 assert any(word in said for word in words), said
                 assert "\n" not in said
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_angles_are_those_of_scipy(order):
+    rotations = Rotation.random(30, random_state=1).as_matrix()
+    angles = angles_about_axes(rotations, order)
+    name = "".join("XYZ"[axis] for axis in order)
+    expected = Rotation.from_matrix(rotations).as_euler(name)
+    np.testing.assert_allclose(angles[:, list(order)], expected, atol=1e-9)
+    np.testing.assert_allclose(composed(angles, order), rotations, atol=1e-12)
+    # What the words say: capital letters are products in their order, small ones the other way.
+    about_fixed = Rotation.from_euler(name[::-1].lower(), expected[:, ::-1]).as_matrix()
+    np.testing.assert_allclose(about_fixed, rotations, atol=1e-12)
+
+
+def test_rotation_vectors_are_those_of_scipy():
+    turns = np.concatenate([Rotation.random(30, random_state=2).as_matrix(), np.eye(3)[None]])
+    expected = Rotation.from_matrix(turns).as_rotvec()
+    np.testing.assert_allclose(vectors_of(turns), expected, atol=1e-9)
 
 
 def test_mirrored_rotations_are_not_taken_for_mirrored_translations(slips):

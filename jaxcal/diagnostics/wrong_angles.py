@@ -8,6 +8,12 @@ For three rotations about different axes i, j, k, with e the sign of this order,
 R = R_i(a) R_j(b) R_k(c) gives the angles back (Tait-Bryan angles):
 
     b = arcsin(e R_ik),  a = atan2(-e R_jk, R_kk),  c = atan2(-e R_ij, R_ii)
+
+scipy's ``Rotation`` does the same (the tests compare), but its import takes a quarter of a second,
+and these checks are part of every calibration.
+
+Reference: Diebel 2006, "Representing attitude: Euler angles, unit quaternions, and rotation
+vectors".
 """
 
 from __future__ import annotations
@@ -34,7 +40,11 @@ FEW_DEGREES = 3.2
 def with_other_angles(
     rotations: Float[np.ndarray, "n 3 3"],
 ) -> Iterator[tuple[str, Float[np.ndarray, "n 3 3"]]]:
-    """The common mistakes with angles: what went wrong and what to do, and corrected rotations."""
+    """The common mistakes with angles: words for each, and the corrected rotations.
+
+    Args:
+        rotations: of the poses, probe -> tracker.
+    """
     for used in ORDERS:
         angles = angles_about_axes(rotations, used)
         for right in ORDERS:

@@ -10,7 +10,7 @@ from jaxcal.runtime.messages import quoted
 _OTHER_PIXELS = 1.02
 """Ratio of two pixel sizes from which on the depth setting is likely to have changed."""
 _OTHER_ORIGIN_MM = 0.05
-"""Difference of two face offsets that is more than the estimate of a delay makes."""
+"""Largest difference of two face offsets that is passed over, mm."""
 
 
 def what_differs(
