@@ -312,6 +312,17 @@ claim(
         ),
     ),
 )
+claim(
+    ACCURACY,
+    "from points alone, it is {:.2f} to {:.2f} times: significantly better in {} of {}, and worse "
+    "in {}.",
+    lambda: (
+        *span(column("further_laws", BY_GAUSSIAN)),
+        significant("further_laws", BY_GAUSSIAN)[0],
+        len(column("further_laws", BY_GAUSSIAN)),
+        significant("further_laws", BY_GAUSSIAN)[1],
+    ),
+)
 SELF_TUNED = "joint, self-tuned"
 claim(
     ACCURACY,
