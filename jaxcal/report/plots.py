@@ -88,7 +88,8 @@ def plot_tre(calibration: Calibration, factor: float = 1.0) -> Figure:
     axes.clabel(lines, fontsize=6, fmt="%.3g")
     poses = recording.calibration.poses[np.asarray(answer.mask) > 0]
     seen = spread_out(targets_in_images(poses, answer.image_to_probe, answer.point))
-    axes.plot(seen[:, 0], seen[:, 2], "o", ms=1.8, mfc="white", mec="black", mew=0.4)
+    # A target at the border of the region is drawn whole.
+    axes.plot(seen[:, 0], seen[:, 2], "o", ms=1.8, mfc="white", mec="k", mew=0.4, clip_on=False)
     axes.set_aspect("equal")
     axes.invert_yaxis()
     axes.set(xlabel="lateral (mm)", ylabel="depth (mm)")
@@ -309,22 +310,10 @@ def _legend(panel: Axes, loc: Any = "best", **place: Any) -> None:
 
 
 def _scale_bar(axes: Axes, length: float) -> None:
-    """A bar of a length (mm), in the lower right corner."""
-    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
-    x = right - 0.05 * (right - left)
-    y = bottom + 0.04 * (top - bottom)
-    axes.plot(
-        [x - length, x], [y, y], color="white", linewidth=2.0, solid_capstyle="butt", zorder=6
-    )
-    # In front of the contours' labels, and readable on any background.
+    """A bar of a length (mm) below the lateral axis, at its right end: it hides nothing there."""
+    right = axes.get_xlim()[1]
+    below = {"transform": axes.get_xaxis_transform(), "clip_on": False}
+    axes.plot([right - length, right], [-0.11] * 2, "k", lw=1.5, solid_capstyle="butt", **below)
     axes.text(
-        x - length / 2,
-        y + 0.025 * (top - bottom),
-        f"{length:g} mm",
-        color="white",
-        ha="center",
-        va="bottom",
-        fontsize=7,
-        zorder=6,
-        bbox={"facecolor": "black", "alpha": 0.55, "linewidth": 0, "pad": 1.5},
+        right - length / 2, -0.12, f"{length:g} mm", ha="center", va="top", fontsize=7, **below
     )
