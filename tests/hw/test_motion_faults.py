@@ -293,6 +293,24 @@ def test_of_two_that_connect_at_once_one_moves_the_robot(robots):
     assert len(sent(robot, 3)) == moves + 1
 
 
+def test_a_program_that_is_started_while_motion_connects_is_not_replaced(robots):
+    robot = put_in_order(robots["e"])
+    asked = robot.state()["dashboard"].count("PolyscopeVersion")
+    with ThreadPoolExecutor(1) as pool, ExitStack() as after:
+        connecting = pool.submit(lambda: moving(robot).__enter__())
+        # Once for the plan, and once more by the process that connects.
+        while robot.state()["dashboard"].count("PolyscopeVersion") < asked + 2:
+            time.sleep(0.01)
+        time.sleep(0.3)
+        robot.ask("play")
+        after.callback(stop_program, robot.host, timeout_s=2.0)
+        error = connecting.exception(30.0)
+        state = robot.state()
+    assert type(error) is RefusedError
+    assert "a program runs on the robot" in str(error)
+    assert state["running"]
+
+
 TAKEN_OVER = {
     "local": ("remote", [False], "local control: switch it to remote"),
     "play": ("play", [], "another program was started on the robot: stop it at the pendant"),

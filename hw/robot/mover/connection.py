@@ -46,6 +46,7 @@ class Connection:
     def __init__(self, setup: Setup, gate: Gate, inputs: Inputs, controller: Controller) -> None:
         self._setup, self._gate = setup, gate
         self._clock, self._inputs, self._controller = setup.clock, inputs, controller
+        self._max_age_s = setup.plan.limits.max_pose_age_s
         self._no_reconnect: NoReconnect | None = None
 
     def open(self) -> None:
@@ -84,6 +85,8 @@ class Connection:
             be_prompt(ASKS)
         controller.answers = _connection_among(set(os.listdir("/proc/self/fd")) - before)
         self._no_reconnect.begin()
+        # To connect took a second or more, in which a person may have started a program.
+        self._check_state(identity.remote)
         with send_program(self._no_reconnect.connect, setup.host, program):
             self._wait_for_packet(running=True)
         _end_within(0.0)
@@ -102,7 +105,7 @@ class Connection:
         reader = PacketReader(self._setup.host)
         asked_s, stamp_s = reader.bound
         lag = Lag(self._clock.at(asked_s), stamp_s)
-        oldest = self._clock.patience(self._setup.plan.limits.max_pose_age_s)
+        oldest = self._clock.patience(self._max_age_s)
         problem = too_late(reader.latency_s * self._clock.speed, oldest)
         if problem is not None:
             raise problem
@@ -110,17 +113,29 @@ class Connection:
         self._wait_for_packet()
 
     def _wait_for_packet(self, *, running: bool = False) -> None:
+        """Read until the newest packet is fresh: many may have come while nobody read them.
+
+        Args:
+            running: wait until a program runs, too.
+
+        Raises:
+            LostError: it takes too long.
+        """
+        inputs, oldest = self._inputs, self._clock.patience(self._max_age_s)
         give_up = self._clock.now() + 2.0 + self._clock.speed
         while self._clock.now() < give_up:
-            self._inputs.read(self._clock.wall(0.01))
-            if self._inputs.connected and (
-                not running or self._inputs.packet.status_bits & PROGRAM_RUNS
+            inputs.read(self._clock.wall(0.01))
+            if (
+                inputs.connected
+                and inputs.sample.age_s(self._clock.now()) <= oldest
+                and (not running or inputs.packet.status_bits & PROGRAM_RUNS)
             ):
                 return
-        raise LostError("the controller sends no poses, or runs no program", device="robot")
+        raise LostError("the controller sends no fresh poses, or runs no program", device="robot")
 
     def _check_state(self, remote: bool | None) -> None:
-        """Whether the robot can take a program now: ur_rtde would stop whatever runs, unasked."""
+        """Whether the robot can take a program now: ours would end whatever runs, unasked."""
+        self._wait_for_packet()
         packet = self._inputs.packet
         problem = LOCAL if remote is False else ""
         problem = problem or state_text(packet.robot_mode, packet.safety_bits)
