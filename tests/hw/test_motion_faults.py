@@ -102,6 +102,7 @@ FAULTS = [
     ("guard", BOTH, StoppedError, "30 echo frames were lost", True),
     ("stop", BOTH, StoppedError, "the operator", True),
     ("kill", BOTH, LostError, "motion process ended", True),
+    ("unreadable", BOTH, LostError, "a packet holds NaN or Inf", True),
     ("silent", BOTH, StaleError, "the caller was silent", False),
     # The same stop for another reason.
     ("end", ["CB"], StoppedError, r"process was asked to end \(SIGTERM\)", True),
@@ -149,6 +150,7 @@ def check_fault(robot: EmulatedRobot, name: str, kind: type, text: str, ends: bo
             "kill": lambda: signal_mover(motion, signal.SIGKILL),
             "end": lambda: signal_mover(motion, signal.SIGTERM),
             "force": lambda: robot.ask("force", [0.0, 0.0, -40.0, 0.0, 0.0, 0.0]),
+            "unreadable": lambda: robot.ask("force", [math.nan] * 6),
             "tcp_offset": lambda: robot.ask(name, [0.0, 0.0, 0.2, 0.0, 0.0, 0.0]),
             "off": lambda: robot.ask("robot_state", 3, 1),
             "backdrive": lambda: robot.ask("robot_state", 6, 1),
@@ -166,6 +168,9 @@ def check_fault(robot: EmulatedRobot, name: str, kind: type, text: str, ends: bo
         if name == "end":
             # In order, not by the controller's watchdog.
             assert robot.state()["reason"] == "the client stopped the script"
+        if name == "unreadable":
+            # The poses are lost, but not the robot: the watchdog alone would take 100 ms.
+            assert robot.state()["log"][-1][1] == 33
         reasons[0] = None
         moves = len(sent(robot, 3))
         if ends:

@@ -31,8 +31,7 @@ def main() -> NoReturn:
         if message is not None:
             _serve(Setup.of(message), caller)
     except Exception as error:
-        cause = LostError(f"{type(error).__name__}: {error}", device="robot")
-        caller.tell("error", ended=True, **told(cause))
+        caller.tell("error", ended=True, **told(_cause_of(error)))
         os._exit(1)
     os._exit(0)
 
@@ -60,15 +59,23 @@ def _serve(setup: Setup, caller: Caller) -> NoReturn:
         caller.tell("ready", serial=controller.serial, tcp_offset=inputs.tcp_offset)
         loop.run()
         connection.close()
-    except (Ended, DeviceError) as error:
-        cause = error.cause if isinstance(error, Ended) else error
-        cause = combined(inputs.latch.stop, cause)
-        answer = told(cause)
+    except Exception as error:
+        loop.let_go()
+        answer = told(combined(inputs.latch.stop, _cause_of(error)))
         answer["text"] += connection.end_paused()
         caller.tell("error", ended=True, **answer)
         os._exit(1)
     caller.tell("closed")
     os._exit(0)
+
+
+def _cause_of(error: Exception) -> DeviceError:
+    """Why motion has ended, for the caller; anything unknown is a fault of this program."""
+    if isinstance(error, Ended):
+        return error.cause
+    if isinstance(error, DeviceError):
+        return error
+    return LostError(f"{type(error).__name__}: {error}", device="robot")
 
 
 def combined(stop: Stop | None, error: DeviceError) -> DeviceError:

@@ -110,6 +110,15 @@ class ControlLoop:
                 self._reported = now
                 self._caller.tell("alive")
 
+    def let_go(self) -> None:
+        """Stop a motion that may still run when this process ends, as where the poses are lost.
+
+        The controller's watchdog would stop it, too, but later, and by means never tried on a real
+        robot.
+        """
+        if self._moving is not None:
+            self._controller.stop_unseen()
+
     def _watch(self) -> None:
         stop = self._monitor.trouble(self._moving)
         if stop is not None:
@@ -165,11 +174,11 @@ class ControlLoop:
         # The questions took time: check again for a stop, and check the move from the newest pose.
         self._heed()
         command = self._allow(pose, speed_mm_s)
+        self._moving = command
         controller.move(list(command.raw), command.speed_m_s, command.acceleration_m_s2)
         now = self._clock.now()
         self._steady_due, self._changed = now + _STEADY_S, now
         self._deadline = now + 1.5 * command.duration_s + self._clock.patience(_LEAST_PATIENCE_S)
-        self._moving = command
         # A stop that came while moveL was being sent acts at once, not a tick later.
         self._heed()
 
@@ -251,6 +260,7 @@ class ControlLoop:
             self._caller.tell("stopping", **told(done.error))
             self._controller.brake()
         assert done is not None
+        self._moving = None
         if done.for_good:
             if self._controller.usable():
                 self._connection.end_script()
@@ -258,7 +268,6 @@ class ControlLoop:
         if self._controller.usable():
             self._controller.watch_rest()
         self._latch.release()
-        self._moving = None
         asked = self._inputs.moves[-1]["move"] if self._inputs.moves else self._count
         self._inputs.moves.clear()
         if asked > self._inputs.answered:

@@ -19,6 +19,7 @@ import math
 import signal
 import socket
 import struct
+from contextlib import suppress
 from typing import Any
 
 from hw.robot.mover.inputs import Ended, Inputs, lost
@@ -191,6 +192,12 @@ class Controller:
                         "reported pose is frozen: press the emergency stop if it moves"
                     )
                 raise Ended(LostError(text, device="robot"))
+
+    def stop_unseen(self) -> None:
+        """Send stopL once, where nobody will see whether the robot rests then."""
+        with suppress(Ended):
+            if self.usable():
+                self.command("stopL", _STOP_M_S2, True)
 
     def _rests(self) -> bool:
         """Whether the poses show rest for :data:`_REST_SEEN_S`; False: send stopL again."""
