@@ -11,15 +11,20 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from types import FrameType
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from robots import address
 
 from hw.robot.confirmation import Confirmation
+from hw.robot.gate import Command, Gate
 from hw.robot.limits import Limits
 from hw.robot.motion_plan import MotionPlan
 from hw.robot.mover.__main__ import combined
+from hw.robot.mover.connection import Connection
+from hw.robot.mover.control_loop import ControlLoop
+from hw.robot.mover.controller import Controller
 from hw.robot.mover.inputs import Inputs, Stop, StopLatch
 from hw.robot.mover.messages import (
     Caller,
@@ -30,6 +35,7 @@ from hw.robot.mover.messages import (
     sample_of,
     told,
 )
+from hw.robot.mover.monitor import Monitor
 from hw.robot.mover.no_reconnect import NoReconnect
 from hw.robot.rtde import PendantSettings
 from hw.robot.stream import PoseSample
@@ -206,6 +212,24 @@ def test_what_follows_a_stop_for_good_does_not_replace_it():
     assert type(both) is StoppedError
     assert both.args[0] == "danger; the program stopped"
     assert type(combined(SILENCE, lost)) is LostError
+
+
+def test_a_move_that_is_refused_at_the_last_moment_leaves_the_watchdog_at_rest(monkeypatch):
+    """A delay of 0.1 s at rest would then have ended the program, and motion with it."""
+    setup = Setup("127.0.0.1", PLAN, None, CLOCK, False, 0.15)
+    gate, inputs, controller, caller, connection = (
+        Mock(spec=kind) for kind in (Gate, Inputs, Controller, Caller, Connection)
+    )
+    allowed = Command(0, (0.0,) * 6, np.eye(4), 1.0, 1e-3, 0.1, 1.0)
+    gate.check_move.side_effect = [allowed, StaleError("too old", device="robot")]
+    controller.serial, caller.left = PLAN.serial, False
+    inputs.latch, inputs.tcp_offset, inputs.pendant = StopLatch(), None, None
+    monkeypatch.setattr(Monitor, "trouble", lambda self, moving: None)
+    loop = ControlLoop(setup, gate, inputs, controller, connection, caller)
+    loop._take({"move": 1, "pose": [], "speed_mm_s": None})
+    sent = [name for name, *_ in controller.method_calls if name.startswith(("watch", "move"))]
+    assert sent == ["watch_motion", "watch_rest"]
+    assert caller.tell.call_args.kwargs["kind"] == "StaleError"
 
 
 def test_a_name_with_several_addresses_is_reached_at_the_one_that_answers(monkeypatch):

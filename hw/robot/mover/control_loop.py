@@ -173,7 +173,12 @@ class ControlLoop:
         controller.watch_motion()
         # The questions took time: check again for a stop, and check the move from the newest pose.
         self._heed()
-        command = self._allow(pose, speed_mm_s)
+        try:
+            command = self._allow(pose, speed_mm_s)
+        except DeviceError:
+            # At rest a delay of 0.1 s must not end the program.
+            controller.watch_rest()
+            raise
         self._moving = command
         controller.move(list(command.raw), command.speed_m_s, command.acceleration_m_s2)
         now = self._clock.now()
