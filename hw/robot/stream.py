@@ -74,9 +74,14 @@ class PoseSample:
         """(4, 4) mm: tool centre point -> robot base."""
         return ur_to_pose(np.asarray(self.raw))
 
+    @property
+    def measured_s(self) -> float:
+        """Bench time (s) before which the controller did not measure it."""
+        return self.t_host - self.lag_s
+
     def age_s(self, now: float) -> float:
         """Bench seconds since the controller measured it, as far as that can be known."""
-        return now - self.t_host + self.lag_s
+        return now - self.measured_s
 
     def age_text(self, now: float) -> str:
         """Its age in words, split into the time since arrival and the latency before."""
@@ -236,6 +241,8 @@ class PoseStream:
     def steady(self, seconds: float = 0.2) -> SteadyPose:
         """Average the poses of the next bench seconds; does not touch :meth:`drain`.
 
+        Poses that come late, and may be from before, do not count.
+
         Raises:
             LostError: the connection was lost.
             StaleError: too few poses came.
@@ -247,7 +254,7 @@ class PoseStream:
         with self._lock:
             self._listeners.append(come)
             try:
-                while not come or come[-1].t_host < start + seconds:
+                while not come or come[-1].measured_s < start + seconds:
                     if self._error or waiting.so_far() > longest:
                         break
                     self._condition.wait(_TURN_WALL_S)
@@ -256,8 +263,8 @@ class PoseStream:
                 self._listeners = [other for other in self._listeners if other is not come]
             error = self._error
         self._check(error)
-        seen = [sample for sample in come if sample.t_host >= start]
-        if not seen or seen[-1].t_host < start + seconds:
+        seen = [sample for sample in come if sample.measured_s >= start]
+        if not seen or seen[-1].measured_s < start + seconds:
             raise StaleError(f"no pose for {seconds:g} s while averaging", device="robot")
         return average(seen)
 

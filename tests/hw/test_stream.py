@@ -24,9 +24,9 @@ from robots import CB_SERIES, E_SERIES, START, EmulatedRobot, address
 from hw.bench.arm import Arm
 from hw.bench.rtde import RtdeServer
 from hw.robot.identity import read_identity
-from hw.robot.rtde import PacketReader, PendantSettings, safety_text
+from hw.robot.rtde import Packet, PacketReader, PendantSettings, safety_text
 from hw.robot.stream import PoseSample, PoseStream, average
-from hw.runtime.clock import Clock, Lag
+from hw.runtime.clock import Clock, Lag, monotonic_s
 from hw.runtime.errors import LostError, RefusedError, StaleError
 from hw.runtime.rigid import ur_to_pose
 
@@ -213,6 +213,37 @@ def test_averages_of_steady_poses(robots):
     mean = average([PoseSample(0.0, 0.0, tuple(raw), 1, 7, 2) for raw in raws])
     assert mean.scatter_mm == pytest.approx(0.1 * np.sqrt(3), rel=0.05)
     np.testing.assert_allclose(mean.sample.raw, START, atol=1e-4)
+
+
+def test_an_average_is_of_poses_from_within_its_time():
+    """A reader that was held up hands over, all at once, poses from the way to the pose."""
+    stream, began = PoseStream("nowhere"), monotonic_s()
+    stream._lag = Lag(stream.clock.at(began), 0.0)
+
+    def come(x: float, late_s: float) -> None:
+        now = monotonic_s()
+        still = (0.0,) * 6
+        pose = (x, *START[1:])
+        stream._take(
+            [Packet(now, now - began - late_s, pose, still, still, 7, 2, 3, 1, None,
+                    PendantSettings())]
+        )  # fmt: skip
+
+    def feed() -> None:
+        # Once the average has begun.
+        while not stream._listeners:
+            time.sleep(0.001)
+        come(START[0] + 0.01, late_s=1.0)
+        while stream._listeners:
+            come(START[0], late_s=0.0)
+            time.sleep(0.002)
+
+    feeder = threading.Thread(target=feed)
+    feeder.start()
+    steady = stream.steady(0.05)
+    feeder.join()
+    assert steady.count > 1
+    assert steady.sample.raw == pytest.approx(START)
 
 
 def test_lag_finds_late_poses_in_spite_of_drift():
