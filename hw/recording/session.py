@@ -393,14 +393,23 @@ class Session:
             with self._lock:
                 self._failure = error
                 self._changed.notify_all()
-        # Data from before a device was lost belong into the file too.
-        with suppress(CalibrationError):
-            self._hand_over()
+        # Data from before a device was lost belong into the file, and how the robot comes to rest.
+        while True:
+            ending = self._stopping
+            self._waiting_poses += self.poses.drain()
+            with suppress(CalibrationError):
+                self._hand_over()
+            if ending:
+                return
+            time.sleep(_BATCH_WALL_S)
 
     def _empty(self) -> None:
+        # What was taken from one device waits for the file, even where another is found to be lost.
         frames = self.echo.drain()
+        self._waiting_echo += frames
         images = [] if self.images is None else self._of_one_device(self.images.drain())
         poses = self.poses.drain()
+        self._waiting_poses += poses
         now, counts = self.clock.now(), self.echo.statistics()
         with self._lock:
             for what, text in _BAD_FRAMES.items():
@@ -433,8 +442,6 @@ class Session:
         self._stamp("robot", [(pose.t_device, pose.t_host) for pose in poses[-1:]])
         self._stamp("active echo", [(frame.ticks / hz, frame.t_host) for frame in frames[-1:]])
         self._stamp("ultrasound", [(image.t_device, image.t_host) for image in images[-1:]])
-        self._waiting_poses += poses
-        self._waiting_echo += frames
         if self._every_frame:
             self._record_images(images)
         if time.monotonic() - self._handed_over > _BATCH_WALL_S:

@@ -33,7 +33,7 @@ from hw.recording.layout import RecordingHeader
 from hw.recording.recorder import Recorder
 from hw.recording.session import DELAY_S, Session, SilenceLimits, frame_period
 from hw.runtime.clock import Clock
-from hw.runtime.errors import DeviceError, RefusedError, StaleError
+from hw.runtime.errors import DeviceError, LostError, RefusedError, StaleError
 from hw.setup.description import Setup
 from jaxcal.data.probe import LinearProbe
 from jaxcal.io.openigtlink import Message
@@ -292,6 +292,42 @@ def test_a_pose_that_changes_at_rest_is_no_pose_of_an_image(tmp_path):
             robot.ask("tcp_offset", (0.0, 0.0, 0.102, 0.0, 0.0, 0.0))
             with pytest.raises(RefusedError, match="set the TCP offset as before"):
                 stage.resting_pose(0.1)
+
+
+def test_what_came_before_and_after_a_device_was_lost_is_recorded(tmp_path):
+    """Frames that had just been taken from another device were lost, and all later poses."""
+    path, drained, lost_s = tmp_path / "r.h5", [], []
+    scene = Scene(np.eye(4), np.array([400.0, -100.0, 0.0]), np.array([0.0, 0.0, -1.0]))
+    with (
+        EmulatedRobot() as robot,
+        AuspisEmulator(silence, clock=robot.clock, lines=8, rate_hz=100.0) as emulator,
+        ImageServer(lambda t: np.zeros((40, 30), np.uint8), clock=robot.clock) as machine,
+        Recorder(path, RecordingHeader("pixel", {}, 8, settings="{}")) as recorder,
+    ):
+        setup = Setup(
+            robot.host, emulator.path, scene, {}, (machine.host, machine.port),
+            probe=LinearProbe(elements=8), clock=robot.clock,
+        )  # fmt: skip
+        with Session(setup, recorder) as session:
+            images, drain = session.images, session.echo.drain
+            assert images is not None
+
+            def lost() -> list:
+                if drained and drained[-1]:
+                    lost_s.append(robot.clock.now())
+                    raise LostError("has closed the connection", device="ultrasound")
+                return []
+
+            session.echo.drain = lambda: drained.append(drain()) or drained[-1]
+            images.drain = lost
+            while session._failure is None:
+                time.sleep(0.01)
+            time.sleep(0.1)
+        recorder.sync()
+    with h5py.File(path) as file:
+        kept = set(file["ae/frame_id"][()])
+        assert {frame.frame for frames in drained for frame in frames} <= kept
+        assert file["tracker/t_host"][-1] > lost_s[0] + 0.05
 
 
 def test_devices_are_closed_though_closing_was_interrupted(tmp_path, monkeypatch):
