@@ -143,7 +143,24 @@ class RecordingWriter:
         writer = cls(Path(path), file)
         if damaged is not None:
             writer.note("salvaged", f"what was whole; the damaged file is {damaged.name}")
+        writer._match_placements()
         return writer
+
+    def _match_placements(self) -> None:
+        """Give each selected image one row of /placement: those to come must belong together.
+
+        The writer may have ended between the two rows, or one of them was damaged. What is lost is
+        NaN.
+        """
+        placement = _columns(self._file, "placement")
+        if not placement or "max_elevation" not in _columns(self._file, "calibration"):
+            return  # images of a free-hand acquisition are not placed
+        images, rows = self.rows["calibration"], self.rows["placement"]
+        if rows < images:
+            self.append("placement", {key: np.full(images - rows, np.nan) for key in placement})
+        for column in placement.values():
+            column.resize(images, axis=0)
+        self.rows["placement"] = images
 
     def note(self, kind: str, text: str) -> None:
         """Append an event without a host time."""

@@ -29,7 +29,7 @@ import jaxcal
 from hw.midplane.bracket import Bracket
 from hw.recording.check import check_resumable, settings_of
 from hw.recording.file import RecordingWriter
-from hw.recording.layout import RecordingHeader
+from hw.recording.layout import LAYOUT, SELECTED, RecordingHeader
 from hw.recording.recorder import Recorder
 from jaxcal.cli.main import main
 from jaxcal.data.timing import ClockFit
@@ -621,6 +621,32 @@ def test_what_a_power_cut_leaves_is_resumed(tmp_path, seed):
         assert b"salvaged" in file["events/kind"][:]
     assert {each.name for each in tmp_path.iterdir()} == {"rec.h5", "rec.h5.damaged"}
     RecordingWriter.resume(path).finish()
+
+
+@pytest.mark.parametrize("more", ["calibration", "placement"])
+def test_each_image_of_a_resumed_recording_has_its_own_placement(tmp_path, more):
+    """A disk that is full between the two rows, or a torn one, shifted all placements to come."""
+    path, header = tmp_path / "rec.h5", RecordingHeader("point", PROBE, settings="{}")
+    tails = {"pose": (4, 4), "point": (2,)}
+
+    def add(writer: RecordingWriter, name: str, value: float) -> None:
+        keys = SELECTED["point"] if name == "calibration" else LAYOUT[name]
+        writer.append(name, {key: np.full((1, *tails.get(key, ())), value) for key in keys})
+
+    writer = RecordingWriter.create(path, header)
+    for name in ("calibration", "placement", more):
+        add(writer, name, 1.0)
+    writer.close()
+    writer = RecordingWriter.resume(path)
+    for name in ("calibration", "placement"):
+        add(writer, name, 2.0)
+    assert writer.rows["calibration"] == writer.rows["placement"]
+    writer.close()
+    with h5py.File(path) as file:
+        offset, target = file["placement/offset"][()], file["calibration/target"][()]
+    between = {"calibration": [1.0, np.nan, 2.0], "placement": [1.0, 2.0]}[more]
+    np.testing.assert_array_equal(offset, between)
+    np.testing.assert_array_equal(target, [1, 1, 2] if more == "calibration" else [1, 2])
 
 
 def test_a_folder_without_hard_links_takes_recordings(tmp_path, monkeypatch):
