@@ -36,7 +36,7 @@ from collections.abc import Callable
 import numpy as np
 
 from hw.robot.confirmation import Confirmation
-from hw.robot.limits import CALLER_S
+from hw.robot.limits import CALLER_S, between
 from hw.robot.motion_plan import MotionPlan
 from hw.robot.mover.messages import WATCHDOG, Setup, error_of, line_of, sample_of, told
 from hw.robot.path_checks import check_plan
@@ -75,7 +75,11 @@ class Motion:
             number), every refusal and every stop. If it fails, the robot is stopped.
         guard: see :data:`Guard`; may be set at any time.
         caller_s: bench seconds that this process may be silent during a motion, e.g. held up by
-            another thread, before the motion is stopped: while it is silent, no guard is called.
+            another thread, before the motion is stopped: while it is silent, no guard is called. At
+            most 10 s.
+
+    Raises:
+        RefusedError: ``caller_s`` is no such time.
     """
 
     def __init__(
@@ -97,6 +101,7 @@ class Motion:
         self.serial: str | None = None
         self._confirmation = confirmation
         self._log = log or (lambda t, command, numbers: None)
+        between("caller_s", caller_s, 0.0, _SUSPENDED_WALL_S)
         self._caller_s = caller_s
         self._process: subprocess.Popen[bytes] | None = None
         self._thread: threading.Thread | None = None
@@ -162,8 +167,8 @@ class Motion:
                     answer = self._answers.get(timeout=_START_TICK_S)
                 self._check_suspended()
         except BaseException:
-            # Killed while it connects, it would leave a program without a watchdog on the robot.
-            # After a second interrupt it ends by itself.
+            # In order: a program that it has sent already would run on until its watchdog ends it.
+            # After a second interrupt the process ends by itself.
             self.close()
             raise
         if answer.get("what") != "ready":

@@ -318,3 +318,10 @@ def test_danger_or_force_before_a_request_sends_no_motion():
 
 def test_closing_what_was_not_started_does_nothing():
     Motion("127.0.0.1", PLAN, None).close()
+
+
+@pytest.mark.parametrize("caller_s", [math.nan, math.inf, 0.0, 60.0])
+def test_a_silence_without_bound_is_refused(caller_s):
+    """With NaN no silence of the caller ever stopped the robot."""
+    with pytest.raises(RefusedError, match="caller_s must be above 0 and at most 10"):
+        Motion("127.0.0.1", PLAN, None, caller_s=caller_s)
