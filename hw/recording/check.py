@@ -42,6 +42,8 @@ from jaxcal.io.untrusted import (
 
 _PAUSE_S = 1.0
 """Between the last host time of a recording and the first one after it is resumed."""
+_LATEST_S = 1e9
+"""Host times count from the start of a program, or go on from there."""
 _MOST_MEMBERS = 100
 """Arrays in a group that is written once: ten times what an acquisition writes."""
 
@@ -180,6 +182,9 @@ def _last_host_time(root: Node) -> float:
         if node is not None and child(node, "t_host") is not None:
             times = read_column(root, name, "t_host", (UpTo(2**27, "rows"),))
             last.append(float(np.nanmax(times, initial=0.0)))
+    if max(last) > _LATEST_S:
+        # Added to all times to come, it would leave nothing of them.
+        raise FormatError(f"has a host time of {max(last):g} s: no computer runs for so long")
     return max(last)
 
 

@@ -27,7 +27,7 @@ from suspending import suspend
 
 import jaxcal
 from hw.midplane.bracket import Bracket
-from hw.recording.check import check_resumable, settings_of
+from hw.recording.check import check_resumable, last_host_time, settings_of
 from hw.recording.file import RecordingWriter
 from hw.recording.layout import LAYOUT, SELECTED, RecordingHeader
 from hw.recording.recorder import Recorder
@@ -573,6 +573,20 @@ def test_files_that_are_not_resumed(tmp_path):
         lambda file: file.attrs.__setitem__("format", "other"),
     ):
         spoil(change)
+
+
+def test_a_host_time_that_cannot_be_is_not_gone_on_from(tmp_path):
+    """All times of the resumed run were infinite."""
+    path = tmp_path / "rec.h5"
+    texts = {name: np.array([b"x"]) for name in ("utc", "kind", "text")}
+    RecordingWriter.create(path, HEADER).close()
+    for last_s in (3.0, np.inf):
+        assert last_host_time(path) == (0.0 if last_s == 3.0 else 3.0)
+        writer = RecordingWriter.resume(path)
+        writer.append("events", {"t_host": np.array([last_s]), **texts})
+        writer.close()
+    with pytest.raises(jaxcal.FormatError, match="a host time of inf s"):
+        last_host_time(path)
 
 
 def test_a_recording_that_a_reader_holds_open_is_not_said_to_be_written(tmp_path):
