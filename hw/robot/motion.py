@@ -160,12 +160,12 @@ class Motion:
             self._thread.start()
             deadline = time.monotonic() + _START_PATIENCE_S
             answer: dict = {}
+            self._told = time.monotonic()
             while not answer and time.monotonic() < deadline:
-                # It may be silent while it connects; this process waits in short steps.
-                self._told = time.monotonic()
                 with contextlib.suppress(queue.Empty):
                     answer = self._answers.get(timeout=_START_TICK_S)
-                self._check_suspended()
+                # It may be silent while it connects; this process waits in short steps.
+                self._told = self._check_suspended()
         except BaseException:
             # In order: a program that it has sent already would run on until its watchdog ends it.
             # After a second interrupt the process ends by itself.
@@ -370,11 +370,15 @@ class Motion:
                 self._kill(error)
                 raise error
 
-    def _check_suspended(self) -> None:
-        """Stop for good after a long suspension (Ctrl-Z)."""
-        silent = time.monotonic() - self._told
+    def _check_suspended(self) -> float:
+        """Stop for good after a long suspension (Ctrl-Z); the time to which that was checked."""
+        now = time.monotonic()
+        silent = now - self._told
         if silent > _SUSPENDED_WALL_S + self.clock.wall(0.5):
-            self.stop(f"this program was suspended for {silent:.0f} s")
+            self.stop(
+                f"this program, or the one that moves the robot, was suspended for {silent:.0f} s"
+            )
+        return now
 
     def _kill(self, error: DeviceError) -> None:
         self._ended = self._ended or error
@@ -403,8 +407,7 @@ class Motion:
         try:
             with self._process.stdout as lines:
                 for line in lines:
-                    self._check_suspended()
-                    self._heard = self._told = time.monotonic()
+                    self._heard = self._told = self._check_suspended()
                     self._hear(json.loads(line))
         finally:
             what, text = "error", "the motion process ended; the robot's own watchdog stops it"

@@ -30,6 +30,7 @@ from motions import (
     sent,
 )
 from robots import CB_SERIES, START, EmulatedRobot
+from suspending import suspend
 
 from hw.robot.confirmation import confirm_unattended
 from hw.robot.identity import read_identity
@@ -253,13 +254,27 @@ def test_a_caller_that_was_suspended_for_long_does_not_go_on_by_itself(monkeypat
         with subprocess.Popen(["sh", "-c", script]) as suspending:
             if moving_when == "at rest":
                 suspending.wait()
-            with pytest.raises((StoppedError, RefusedError), match="program was suspended for"):
+            with pytest.raises(
+                (StoppedError, RefusedError), match="moves the robot, was suspended for"
+            ):
                 motion.move_to(PLAN.targets[2])
         assert motion.ended
         assert len(sent(robot, 3)) == (moving_when == "in motion")
         assert robot.state()["velocity"] == [0.0] * 6
         with pytest.raises(RefusedError, match=r"suspended for .*confirm the plan"):
             motion.move_to(PLAN.targets[2])
+
+
+def test_a_process_that_was_suspended_at_rest_is_named(monkeypatch):
+    """The caller was blamed alone, which had asked for nothing meanwhile."""
+    monkeypatch.setattr("hw.robot.motion._SUSPENDED_WALL_S", 0.2)
+    with EmulatedRobot() as robot, moving(robot) as motion:
+        assert motion._process is not None
+        suspend(motion._process.pid)
+        time.sleep(0.8)
+        with pytest.raises(RefusedError, match="or the one that moves the robot, was suspended"):
+            motion.check()
+        os.kill(motion._process.pid, signal.SIGCONT)
 
 
 def test_a_caller_that_was_suspended_while_it_connects_does_not_move(monkeypatch):
@@ -269,7 +284,7 @@ def test_a_caller_that_was_suspended_while_it_connects_does_not_move(monkeypatch
         EmulatedRobot() as robot,
         subprocess.Popen(["sh", "-c", script]),
         moving(robot) as motion,
-        pytest.raises(RefusedError, match="program was suspended for"),
+        pytest.raises(RefusedError, match="moves the robot, was suspended for"),
     ):
         motion.move_to(PLAN.targets[2])
     assert motion.ended
