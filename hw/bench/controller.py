@@ -106,6 +106,8 @@ class Controller:
     payload_cog_m: tuple[float, ...] = (0.0, 0.0, 0.0)
     overspeed: float = 1.0
     """A fault: motions are so many times as fast as commanded."""
+    heeds_stops: bool = True
+    """Unless a fault: commands to stop are taken, but the arm goes on."""
     speed_fraction: float = 1.0
     """Position of the speed slider, 0 to 1."""
     told: Callable[[str, bool], None] = field(default=lambda reason, fault: None, repr=False)
@@ -284,7 +286,8 @@ class Controller:
             case 24:
                 self.arm.servo(t, d[:6], d[8])
             case 15 | 16 | 33 | 34:
-                self._stop(t, d[0])
+                if self.heeds_stops:
+                    self._stop(t, d[0])
             case 8:
                 self.arm.force = (0.0,) * 6
             case 17:

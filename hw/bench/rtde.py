@@ -182,6 +182,7 @@ class RtdeServer:
         - ``tcp_offset`` (m, rad), ``payload`` (kg and, or not, its centre of gravity, m),
           ``speed_slider`` (0 to 1): other settings at the pendant;
         - ``overspeed`` (factor): motions from now on are so many times as fast as commanded;
+        - ``heed stops`` (on): whether a command to stop the arm has any effect;
         - ``freeze`` (on): pose, speed and joints stay what they were, in packets with new stamps;
         - ``stamps`` (s, rate): its time stamps are ahead of bench time by so much, and go so fast;
         - ``dashboard`` (text): it answers with this text, with "" not at all, with None as usual.
@@ -227,6 +228,8 @@ class RtdeServer:
                 program.speed_fraction = float(fraction)
             case ["overspeed", factor]:
                 program.overspeed = float(factor)
+            case ["heed stops", on]:
+                program.heeds_stops = bool(on)
             case ["freeze", on]:
                 now = self._values(t)
                 self._frozen = {name: now[name] for name in _MEASURED & now.keys()} if on else {}

@@ -195,6 +195,25 @@ def test_a_robot_that_is_faster_than_commanded_is_stopped(robots):
     assert abs(1000.0 * robot.state()["raw"][0] - target[0, 3]) > 1.0
 
 
+def test_a_robot_that_does_not_heed_a_stop_is_stopped_by_its_watchdog(robots):
+    """It was kept alive for two seconds by the process that told it to stop again and again."""
+    robot = put_in_order(robots["CB"])
+    robot.ask("heed stops", False)
+    slow = replace(PLAN, limits=replace(PLAN.limits, max_speed_mm_s=15.0))
+    with moving(robot, plan=slow, caller_s=2.0) as motion, ThreadPoolExecutor(1) as pool:
+        stopping = pool.submit(motion.move_to, farther(robot))
+        while not any(robot.state()["velocity"]) and not stopping.done():
+            time.sleep(0.002)
+        before = robot.state()["t"]
+        motion.stop("danger")
+        with pytest.raises(StoppedError, match=r"danger; .*still moves: press the emergency stop"):
+            stopping.result(20.0)
+        while (state := robot.state())["rest_since"] is None:
+            time.sleep(0.01)
+    assert state["reason"].startswith("watchdog")
+    assert state["rest_since"] - before < 1.5
+
+
 def test_poses_that_are_frozen_with_new_stamps_end_motion(robots):
     """Box and arrival are checked by the poses: the arm would move unseen up to its target."""
     robot = robots["CB"]

@@ -39,7 +39,11 @@ _REST_SEEN_S = 0.03
 """A stop is done when the poses have shown rest for so long after stopL (4 poses at 125 Hz)."""
 _STOP_AGAIN_S = 0.05
 """stopL is sent again to a robot that still moves after this time."""
+_BRAKES_S = 0.5
+"""A robot that still moves so long after stopL does not heed it: four times as long as braking from
+250 mm/s takes."""
 STOP_PATIENCE_S = 2.0
+"""Longest wait for poses that show rest."""
 _TCP_INFO, _ESTABLISHED = struct.Struct("=B51xI"), 1
 """State of a connection and milliseconds since its last data, in Linux's ``struct tcp_info``."""
 _UNHEARD_S = 0.5
@@ -174,17 +178,21 @@ class Controller:
         """Send stopL until the poses show rest, as long as the controller takes commands.
 
         Raises:
-            Ended: the robot does not stop, or is lost.
+            Ended: the robot does not stop, or is lost. With the process's end the watchdog hears no
+                more, and stops the controller's program.
         """
         give_up = self._clock.now() + self._clock.patience(STOP_PATIENCE_S)
-        before = self._inputs.packet.tcp_pose
+        before, taken_s = self._inputs.packet.tcp_pose, math.inf
         while self.usable():
             # Asynchronous: a call that waits for rest would hold the watchdog's kicks back, and
             # braking may take longer than the watchdog waits. The poses show what stopL did.
             self.command("stopL", _STOP_M_S2, True)
+            taken_s = min(taken_s, self._clock.now())
             if self._rests():
                 return
-            if self._clock.now() > give_up:
+            late_s = self._inputs.sample.measured_s - taken_s
+            unheeded = late_s > self._clock.patience(_BRAKES_S) and _moves(self._inputs.packet)
+            if unheeded or self._clock.now() > give_up:
                 text = "the robot was told to stop and still moves: press the emergency stop"
                 if self._inputs.packet.tcp_pose == before:
                     text = (
@@ -208,9 +216,7 @@ class Controller:
             self._inputs.read(self._clock.wall(_REST_SEEN_S / 4))
             self.kick()
             packet = self._inputs.packet
-            if packet.timestamp_s > since and (
-                packet.speed_mm_s > _STOPPED_MM_S or packet.turning_rad_s > _STOPPED_RAD_S
-            ):
+            if packet.timestamp_s > since and _moves(packet):
                 since = packet.timestamp_s
                 if since - sent > _STOP_AGAIN_S:
                     return False
@@ -248,6 +254,10 @@ class Controller:
             text = "another program was started on the robot: stop it at the pendant"
             return StoppedError(f"{text}, then confirm the plan again", device="robot")
         return lost(what)
+
+
+def _moves(packet: Packet) -> bool:
+    return packet.speed_mm_s > _STOPPED_MM_S or packet.turning_rad_s > _STOPPED_RAD_S
 
 
 def unfit(packet: Packet) -> StoppedError | None:
