@@ -39,6 +39,7 @@ from hw.midplane.pattern_injection import (
 )
 from hw.midplane.search import PlacementError, first_seen
 from hw.midplane.threshold_climb import threshold_climb
+from hw.recording.check import Progress
 from hw.recording.recorder import Recorder, no_digest
 from hw.recording.resuming import compare_electronics, described_electronics
 from hw.recording.session import Session, SilenceLimits, median_times
@@ -162,7 +163,7 @@ def acquire(
             if job.progress is not None and job.progress.ended:
                 # It was complete before this run, and stays so.
                 if emulated is not None:
-                    _write_truth(recorder, emulated)
+                    _write_truth(recorder, emulated, job.progress)
                 _finish(recorder, job.images - estimator.count)
 
     try:
@@ -252,7 +253,7 @@ class _Run:
             with motion:
                 self._take_images(session, ProbeStage(session, motion, job.targets, self._note))
         if self.emulated is not None:
-            _write_truth(recorder, self.emulated)
+            _write_truth(recorder, self.emulated, job.progress)
         self._note("finished", f"{estimator.count} images")
         without = tuple(sorted(self.without))
         # A pool has other poses for those without an image.
@@ -444,12 +445,15 @@ def _finish(recorder: Recorder, without_image: int) -> str:
     return recorder.finish()
 
 
-def _write_truth(recorder: Recorder, emulated: Bench) -> None:
+def _write_truth(recorder: Recorder, emulated: Bench, progress: Progress | None) -> None:
     recorder.sync()
-    world = emulated.world_truth()
     poses, points = emulated.test_set()
-    recorder.put("truth", "image_to_probe", world["image_to_probe"], "mm")
-    recorder.put("truth", "point", world["point_mm"], "mm")
     recorder.put("test", "pose", poses, "mm")
     recorder.put("test", "point", points, "mm")
+    if progress is not None and not np.isfinite(progress.true_elevation).all():
+        # The placement of an image was lost; /truth holds all images or is not there.
+        return
+    world = emulated.world_truth()
+    recorder.put("truth", "image_to_probe", world["image_to_probe"], "mm")
+    recorder.put("truth", "point", world["point_mm"], "mm")
     recorder.copy("placement", "true_elevation", "truth", "elevation")

@@ -77,7 +77,7 @@ def lines_of(path: str, outcome: Outcome, speed: float) -> list[str]:
 
 
 def share_inside(path: str) -> tuple[int, int, float] | None:
-    """Images whose true offset lies inside its bracket, all images, and the offsets' SD (mm).
+    """Images whose true offset lies in its bracket, those where it is known, their SD (mm).
 
     None for recordings of a real bench.
     """
@@ -85,6 +85,8 @@ def share_inside(path: str) -> tuple[int, int, float] | None:
         low, high, true = (
             np.asarray(file[f"placement/{name}"]) for name in ("low", "high", "true_elevation")
         )
-    if not np.isfinite(true).any():
+    known = np.isfinite(true)
+    if not known.any():
         return None
-    return int(((low <= true) & (true <= high)).sum()), len(true), float(true.std(ddof=1))
+    inside = (low <= true) & (true <= high)
+    return int(inside.sum()), int(known.sum()), float(true[known].std(ddof=1))

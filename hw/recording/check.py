@@ -103,7 +103,7 @@ class Progress:
         measurements: (k, elements) times of flight, s, or (k, 2) [lateral, range], mm.
         max_elevation: (k,) mm.
         taken: (k,) row of the plan of every image.
-        true_elevation: (k,) mm, NaN on a real bench.
+        true_elevation: (k,) mm, NaN on a real bench, or where the placement was lost.
         last_s: latest host time in the file.
         probe: numbers of /probe: elements, pitch_mm, sound_speed_m_s, delay_s.
         electronics: ``clock_hz`` and ``identity``, as far as it has them.

@@ -17,6 +17,7 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Self
+from unittest.mock import Mock
 
 import h5py
 import numpy as np
@@ -29,7 +30,7 @@ from motions import LIMITS, OFFSET, SERIAL, beside
 from test_recorder import wait_until_closed
 
 import jaxcal
-from hw.acquisition.acquire import AcquisitionStopped, Outcome, acquire
+from hw.acquisition.acquire import AcquisitionStopped, Outcome, _write_truth, acquire
 from hw.acquisition.job import (
     motion_plan,
     open_recorder,
@@ -44,6 +45,8 @@ from hw.bench.active_echo import AuspisEmulator
 from hw.bench.run import Bench
 from hw.midplane.search import PlacementError, Settings
 from hw.planning.poses import Extent
+from hw.recording.check import Progress
+from hw.recording.recorder import Recorder
 from hw.recording.resuming import check_same_robot
 from hw.recording.session import Session, SilenceLimits
 from hw.robot.confirmation import confirm_unattended
@@ -770,6 +773,25 @@ def test_the_rate_is_that_of_this_run(tmp_path):
     assert lines_of(str(path), outcome, 1.0) == [
         f"60 images in {path}, 6.0 per minute of bench time (100 s)"
     ]
+
+
+def test_truth_is_recorded_only_where_it_is_known_of_all_images(tmp_path):
+    """A finished recording with an unknown elevation was refused by calibrate."""
+    recorder, bench = Mock(spec=Recorder), Mock(spec=Bench)
+    bench.test_set.return_value = np.eye(4)[None], np.zeros((1, 2))
+    bench.world_truth.return_value = {"image_to_probe": np.eye(4), "point_mm": np.zeros(3)}
+    progress = Mock(spec=Progress)
+    for elevation, groups in (([0.1, 0.2], {"test", "truth"}), ([0.1, np.nan], {"test"})):
+        recorder.reset_mock()
+        progress.true_elevation = np.array(elevation)
+        _write_truth(recorder, bench, progress)
+        assert {call.args[0] for call in recorder.put.call_args_list} == groups
+        assert recorder.copy.called == ("truth" in groups)
+    with h5py.File(tmp_path / "rec.h5", "w") as file:
+        for name, values in {"low": -1.0, "high": 1.0}.items():
+            file[f"placement/{name}"] = np.full(3, values)
+        file["placement/true_elevation"] = np.array([0.5, np.nan, 1.5])
+    assert share_inside(str(tmp_path / "rec.h5")) == (1, 2, pytest.approx(np.sqrt(0.5)))
 
 
 def viewers(parent: int) -> list[int]:
