@@ -96,6 +96,8 @@ class Controller:
     safety_mode: int = NORMAL
     remote: bool = True
     """Whether scripts are taken (e-Series: remote control; in local control none are)."""
+    paused: bool = False
+    """Whether a person has paused the program."""
     foreign: bool = False
     """Whether the program that runs is another than ur_rtde's, which answers no registers."""
     log: list[tuple[float, int, tuple[float, ...]]] = field(default_factory=list)
@@ -128,7 +130,7 @@ class Controller:
     @property
     def runtime_state(self) -> int:
         """1 stopped, 2 playing, 4 paused."""
-        if self.safety_mode in (PROTECTIVE, SAFEGUARD):
+        if self.paused or self.safety_mode in (PROTECTIVE, SAFEGUARD):
             return PAUSED
         return PLAYING if self.running else STOPPED
 
@@ -169,18 +171,30 @@ class Controller:
         resumes = self.safety_mode == SAFEGUARD and self.running
         self.robot_mode, self.safety_mode = robot_mode, safety_mode
         if safety_mode == SAFEGUARD and self.running:
-            if self._finishes is not None:
-                self._paused_move = (self.double_in[:6], self.double_in[6], self.double_in[7])
-            self._finishes = None
-            self.arm.stop(t)
+            self._hold(t)
         elif not self.fit:
             self.halt(t, f"robot mode {robot_mode}, safety mode {safety_mode}")
         elif resumes:
-            self._kicked = t
-            if self._paused_move is not None:
-                pose, speed, acceleration = self._paused_move
-                self._finishes = self.arm.move_linear(t, pose, speed, acceleration)
-                self._paused_move = None
+            self._go_on(t)
+
+    def pause(self, t: float, on: bool) -> None:
+        """A person pauses the program, or lets it go on."""
+        if self.running and on != self.paused:
+            self.paused = on
+            self._hold(t) if on else self._go_on(t)
+
+    def _hold(self, t: float) -> None:
+        if self._finishes is not None:
+            self._paused_move = (self.double_in[:6], self.double_in[6], self.double_in[7])
+        self._finishes = None
+        self.arm.stop(t)
+
+    def _go_on(self, t: float) -> None:
+        self._kicked = t
+        if self._paused_move is not None:
+            pose, speed, acceleration = self._paused_move
+            self._finishes = self.arm.move_linear(t, pose, speed, acceleration)
+            self._paused_move = None
 
     def upload(self, t: float, first: Sequence[str] = ()) -> None:
         """A script has come: it replaces the one that runs, if the robot takes scripts now.
@@ -202,7 +216,7 @@ class Controller:
     def halt(self, t: float, reason: str, *, fault: bool = False) -> None:
         """Stop the program, and the arm with it; ``fault``: as a runtime error of the script."""
         ran, self.running = self.running, False
-        self._latched = False
+        self._latched = self.paused = False
         self._waits_for = self._finishes = self._watchdog_s = self._starts = None
         self._paused_move = None
         self.arm.stop(t)
@@ -227,7 +241,7 @@ class Controller:
             # A real controller stops too: for a fast joint, a singularity, the end of the reach.
             self.protect(t, "protective stop: the arm cannot follow the path")
             return
-        if not self.running or self.foreign or not self.fit:
+        if not self.running or self.foreign or self.paused or not self.fit:
             return
         if self._watchdog_s is not None and t - self._kicked > self._watchdog_s:
             self.halt(t, f"watchdog: nothing written for {t - self._kicked:.3f} s")

@@ -179,6 +179,7 @@ class RtdeServer:
         - ``force`` (N and N m): on the tool;
         - ``remote`` (on): remote or local control of an e-Series;
         - ``play``: our program ends, and soon another one runs;
+        - ``pause`` (on): our program is paused, or goes on;
         - ``tcp_offset`` (m, rad), ``payload`` (kg and, or not, its centre of gravity, m),
           ``speed_slider`` (0 to 1): other settings at the pendant;
         - ``overspeed`` (factor): motions from now on are so many times as fast as commanded;
@@ -219,6 +220,8 @@ class RtdeServer:
                 program.remote = bool(on)
             case ["play"]:
                 program.play(t)
+            case ["pause", on]:
+                program.pause(t, bool(on))
             case ["tcp_offset", offset]:
                 self.arm.set_tcp_offset(offset)
             case ["payload", mass_kg, *cog_m]:

@@ -80,8 +80,9 @@ _MODES = {
     8: ("updating its firmware", "wait until it is done"),
 }
 """Values of robot_mode other than running, and what a person must do."""
-_PLAYS = frozenset({2, 3, 4, 5})
-"""Values of runtime_state while a program plays, pauses, is paused, or resumes."""
+_PAUSED = frozenset({3, 4})
+_PLAYS = _PAUSED | {2, 5}
+"""Values of runtime_state while a program pauses or is paused; and plays or resumes."""
 
 
 def safety_text(bits: int) -> str:
@@ -209,6 +210,11 @@ class Packet:
     def program(self) -> bool:
         """Whether a program plays or is paused."""
         return bool(self.status_bits & PROGRAM_RUNS) or self.runtime_state in _PLAYS
+
+    @property
+    def paused(self) -> bool:
+        """Whether a program is paused: it takes no commands, and goes on when it is resumed."""
+        return self.runtime_state in _PAUSED
 
 
 def too_late(latency_s: float, limit_s: float) -> LostError | None:

@@ -296,6 +296,20 @@ def test_a_motion_does_not_go_on_when_a_safeguard_stop_is_released(robots, dashb
             motion.move_to(HOME)
 
 
+def test_a_program_that_a_person_pauses_is_ended(robots):
+    """It was called a frozen pose, and the motion went on when the program was resumed."""
+    robot = put_in_order(robots["CB"])
+    with moving(robot, caller_s=2.0) as motion:
+        error, *_ = fault_in_motion(robot, motion, partial(robot.ask, "pause", True))
+        assert type(error) is StoppedError
+        assert "the program was paused on the robot" in str(error)
+        state = robot.state()
+        assert state["reason"] == "the dashboard stopped it"
+        robot.ask("pause", False)
+        time.sleep(0.1)
+        assert robot.state()["raw"] == state["raw"]
+
+
 def test_of_two_that_connect_at_once_one_moves_the_robot(robots):
     robot = robots["e"]
     put_in_order(robot)

@@ -175,7 +175,7 @@ class Connection:
         self._controller.command("stopScript", within_s=_END_S)
 
     def end_paused(self) -> str:
-        """End a program that a safety stop has paused: it might go on when the stop is released.
+        """End a program that a safety stop or a person has paused: it might be let go on.
 
         A paused program reads no commands, so the dashboard is asked.
 
@@ -185,14 +185,14 @@ class Connection:
         if self._controller.rtde_control is None or self._inputs.program_ended:
             return ""
         packet = self._inputs.packet
-        if not packet.program or not safety_text(packet.safety_bits):
+        if not packet.program or not (packet.paused or safety_text(packet.safety_bits)):
             return ""
         self._controller.log("dashboard: stop")
         assert self._no_reconnect is not None
         connect = self._no_reconnect.connect
         if stop_program(self._setup.host, timeout_s=_DASHBOARD_S, connect=connect):
             return ""
-        return "; the program may be paused: stop it at the pendant before you reset the robot"
+        return "; the program may be paused: stop it at the pendant before you go on there"
 
 
 def _connection_among(descriptors: set[str]) -> socket.socket:

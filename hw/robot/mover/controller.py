@@ -233,6 +233,7 @@ class Controller:
             and self.connected
             and self._inputs.packet.status_bits & PROGRAM_RUNS
             and not self._inputs.program_ended
+            and not self._inputs.packet.paused
             and not safety_text(self._inputs.packet.safety_bits)
         )
 

@@ -52,6 +52,8 @@ class Monitor:
             stopped = unfit(packet)
             if stopped is not None:
                 return Stop(stopped, True)
+        if any(packet.paused for packet in packets):
+            return _for_good("the program was paused on the robot; then confirm the plan again")
         if self._controller.local:
             return _for_good(f"{LOCAL}; then confirm the plan again")
         if inputs.program_ended or not inputs.packet.status_bits & PROGRAM_RUNS:
