@@ -520,7 +520,9 @@ class Session:
         counts: dict[str, EchoStatistics | UltrasoundStatistics] = {"ae": echo}
         full = {"tracker": self.poses.dropped, "ae": echo.dropped}
         if self.images is not None:
-            counts["us"] = self.images.statistics()
+            counts["us"] = images = self.images.statistics()
+            if self._every_frame:
+                full["us"] = images.dropped
         for group, found in counts.items():
             losses = {name: getattr(found, name) for name in _LOSSES if hasattr(found, name)}
             self._recorder.counts(group, losses)

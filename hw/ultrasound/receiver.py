@@ -1,8 +1,8 @@
 """The ultrasound machine's stream: images and transforms from an OpenIGTLink server.
 
-A thread receives, checks and decodes. Good images and transforms wait in bounded queues; those
-dropped for lack of room are counted. An image that comes again with the same time stamp is not a
-new image (the machine is frozen): it is counted and not handed on.
+A thread receives, checks and decodes. Good images and transforms wait in bounded queues, whose
+oldest are dropped for lack of room; images dropped are counted. An image that comes again with the
+same time stamp is not a new image (the machine is frozen): it is counted and not handed on.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ class UltrasoundStatistics:
         lost: images missing in the message ids, where the sender numbers each device's images.
         crc_errors: messages whose CRC was wrong; not handed on.
         resynchronised: how often a message was accepted after something broken.
-        dropped: images and transforms that a full queue had no room for.
+        dropped: images that a full queue had no room for.
         repeated: images that came again with the same time stamp; not handed on.
         unsupported: intact messages with content that is not taken (``reason`` for the last one).
         other: messages of other types or devices; skipped.
@@ -346,8 +346,6 @@ class UltrasoundStream:
             del self._last[next(iter(self._last))]
 
     def _take_transform(self, message: Message, tracked: Tracked) -> None:
-        if len(self._transforms) == self._transforms.maxlen:
-            self._counts.dropped += 1
         self._counts.transforms += 1
         self._transforms.append(
             Transform(

@@ -267,6 +267,9 @@ def test_images_of_a_machine_that_also_sends_rf(tmp_path, server):
                 if image is not None:
                     shown[image.t_device] = image.array.dtype
                 time.sleep(0.005)
+            # As by a queue that was full.
+            session.images._counts.dropped += 3
+        assert recorder.dropped["us"] >= 3
         recorder.sync()
     assert set(shown.values()) == {np.dtype(np.uint8)}
     with h5py.File(path) as file:
