@@ -16,7 +16,7 @@ import numpy as np
 from hw.freehand.guide import Guide, Taken
 from hw.freehand.posed import PosedImages
 from hw.freehand.request import FreeHand, Person, recorded_request
-from hw.freehand.run import KeptImages, Run, read_images, resumed_recorder
+from hw.freehand.run import SILENCE_S, KeptImages, Run, read_images, resumed_recorder
 from hw.recording.layout import RecordingHeader
 from hw.recording.recorder import Recorder
 from hw.runtime.errors import DeviceError
@@ -26,7 +26,6 @@ from jaxcal.data.recording import Recording, make_images
 from jaxcal.data.segmentation.image import check_region
 
 _KIND = "free-hand"
-_SILENCE_S = 3.0
 _LEAST_FOR_ESTIMATE = 6
 _STANDS_OUT = 4.0
 """An image whose residual is more than so many times the median residual is named."""
@@ -98,7 +97,7 @@ class _Run(Run):
 
     def look(self, key: str | None) -> None:
         """Read an image, and keep it if the guide takes it."""
-        posed = self.posed.read(_SILENCE_S)
+        posed = self.posed.read(SILENCE_S)
         frame = posed.image.array
         look = self.guide.look(posed)
         if look.taken is not None:

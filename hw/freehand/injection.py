@@ -27,7 +27,7 @@ from hw.active_echo.device import SILENT, ActiveEcho, EchoFrame
 from hw.freehand.guide import spread_of
 from hw.freehand.posed import PosedImage, PosedImages, pose_at_arrival
 from hw.freehand.request import FreeHand, Person, recorded_request
-from hw.freehand.run import KeptImages, Run, read_images, resumed_recorder
+from hw.freehand.run import SILENCE_S, KeptImages, Run, read_images, resumed_recorder
 from hw.midplane.amplitude_scan import fit_peak
 from hw.midplane.bracket import Bracket
 from hw.midplane.live_view import describe, profile
@@ -52,7 +52,6 @@ from jaxcal.io.given_files import naming
 from jaxcal.runtime.array_types import Float
 
 _KIND = "pattern-injection"
-_SILENCE_S = 3.0
 _PATTERN_PERIOD_S = 0.1
 _ANOTHER_DEG = 5.0
 """When the hand has turned the probe by more than this, a new sweep begins."""
@@ -213,9 +212,9 @@ class _Run(Run):
 
     def _listen(self) -> None:
         # Read all images that wait: the bar must show where the probe is now, however busy the PC.
-        self._images.append(self.posed.read(_SILENCE_S))
+        self._images.append(self.posed.read(SILENCE_S))
         for _ in range(self.posed.behind - 1):
-            self._images.append(self.posed.read(_SILENCE_S))
+            self._images.append(self.posed.read(SILENCE_S))
         now = time.monotonic()
         unknown = not np.isfinite(self._late_s)
         if now - self._delay_measured > (_AGAIN_S if unknown else DELAY_S):
@@ -224,8 +223,8 @@ class _Run(Run):
         frames = self.echo.drain()
         if frames:
             self._heard = now
-        elif now - self._heard > _SILENCE_S:
-            raise StaleError(f"no frame for {_SILENCE_S:g} s: {SILENT}", device="active echo")
+        elif now - self._heard > SILENCE_S:
+            raise StaleError(f"no frame for {SILENCE_S:g} s: {SILENT}", device="active echo")
         self.recorder.add_echo(frames)
         if frames:
             self._late_s = frames[-1].late_s

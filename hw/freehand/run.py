@@ -23,6 +23,9 @@ from jaxcal.io.hdf5 import IMAGES
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.messages import command_line
 
+SILENCE_S = 3.0
+"""A device that is silent for longer ends the run."""
+
 
 class KeptImages:
     """Rows and poses of the images that count; an image taken back keeps its row, masked.

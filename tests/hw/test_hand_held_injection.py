@@ -292,7 +292,7 @@ def test_poses_in_metres_are_told_of(tmp_path, bench):
 
 
 def test_an_element_that_falls_silent_ends_the_run(tmp_path, bench, monkeypatch):
-    monkeypatch.setattr("hw.freehand.injection._SILENCE_S", 0.7)
+    monkeypatch.setattr("hw.freehand.injection.SILENCE_S", 0.7)
 
     class Unplugging(Person):
         def say(self, line: str) -> None:
