@@ -382,6 +382,8 @@ def test_what_no_certificate_can_be_about_is_refused():
     for images, estimate, scale, more, said in (
         (points, (), None, faster, "needs estimate"),
         (pixels, SCALE, [0.2, 0.17], faster, "needs estimate"),
+        (points, (), [1.5, 9.0], {}, "needs estimate"),
+        (points, "sound-speed", [1.5, 9.0], {}, "needs estimate"),
         (square, "common-scale", [0.2, 0.21], {}, "one factor"),
         (pixels, SCALE, [np.nan, 0.17], {}, "finite and positive"),
         (points, "sound-speed", None, {"sound_speed_factor": np.nan}, "finite and positive"),

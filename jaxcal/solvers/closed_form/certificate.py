@@ -113,13 +113,19 @@ def _factors(
     factors = np.array([1.0, sound_speed_factor], float)
     if constraints.free != ("axial",) and abs(factors[1] - 1) > ORTHONORMAL:
         raise InputError('a sound_speed_factor other than 1 needs estimate=("sound-speed",)')
-    if constraints.scaled:
-        if scale_mm_per_px is None:
-            raise InputError("an estimated scale belongs to the answer: give scale_mm_per_px")
+    if scale_mm_per_px is not None:
         check_size("scale_mm_per_px", scale_mm_per_px, tiny, one=False, unit="mm")
         if np.shape(scale_mm_per_px) != (2,):
             raise InputError(f"scale_mm_per_px must be 2 numbers, not {shown(scale_mm_per_px)}")
-        factors = real_array(scale_mm_per_px, "scale_mm_per_px") / spacing
+        sizes = real_array(scale_mm_per_px, "scale_mm_per_px") / spacing
+        if constraints.scaled:
+            factors = sizes
+        elif np.abs(sizes - 1).max() > ORTHONORMAL:
+            raise InputError(
+                'a scale_mm_per_px other than the nominal one needs estimate=("scale",)'
+            )
+    elif constraints.scaled:
+        raise InputError("an estimated scale belongs to the answer: give scale_mm_per_px")
     if constraints.free == ("common",) and abs(factors[1] / factors[0] - 1) > ORTHONORMAL:
         raise InputError(
             "a common scale is one factor on lateral and axial spacing, and these are two: "
