@@ -188,6 +188,19 @@ def test_a_batch_of_rows_without_the_last_one():
     with pytest.raises(jaxcal.InputError, match="a batch holds many"):
         found.record()
     assert str(found).startswith("Pivot(")
+    np.testing.assert_array_equal(found[1].tip, whole.tip[1])
+    assert [each.status for each in found] == ["converged"] * len(found)
+    with pytest.raises(jaxcal.InputError, match="not a batch"):
+        found[0][0]
+
+
+def test_a_mask_may_be_traced_where_the_poses_are_not():
+    poses = swung(random_rotations(12), noise=0.1)
+    with jax.enable_x64(True):
+        solve = jax.jit(lambda mask: jaxcal.calibrate_pivot(poses, mask, robust=False).tip)
+        found = solve(np.arange(12) < 9)
+    known = jaxcal.calibrate_pivot(poses[:9], robust=False)
+    np.testing.assert_allclose(found, known.tip, atol=1e-9)
 
 
 def test_a_batch_with_a_problem_of_too_few_poses_says_which():
@@ -203,6 +216,9 @@ def test_a_batch_with_a_problem_of_too_few_poses_says_which():
 def test_bad_input_is_named():
     with pytest.raises(jaxcal.InputError, match="3 used poses are too few"):
         jaxcal.calibrate_pivot(swung(random_rotations(3)))
+    for none in (np.zeros((0, 4, 4)), np.zeros((2, 0, 4, 4))):
+        with pytest.raises(jaxcal.InputError, match="0 poses are too few"):
+            jaxcal.calibrate_pivot(none)
     poses = swung(random_rotations(8))
     poses[5, 0, 0] = np.nan
     with pytest.raises(jaxcal.InputError, match="5"):

@@ -88,6 +88,14 @@ def test_batches_and_traces_print_without_a_verdict(recording):
     np.testing.assert_allclose(batch.image_to_probe[1], one.image_to_probe, atol=1e-9)
     assert [each.status for each in batch] == ["converged"] * 2
     assert len(batch) == len(list(batch)) == 2
+    grid = jax.tree.map(lambda leaf: leaf[None], batch)
+    for part in (batch[..., 1], batch[[0, 1]][-1], grid[0, 1], grid[..., 1][0], grid[:, 1][0]):
+        np.testing.assert_array_equal(part.image_to_probe, batch.image_to_probe[1])
+        assert part.mask.shape == one.mask.shape
+    with pytest.raises(jaxcal.InputError, match="traced"):
+        jax.jit(lambda index: batch[index].rms)(1)
+    with pytest.raises(IndexError):
+        _ = batch[2]
     none = batch[:0]
     assert all([one, batch, none])
     assert none.residual.shape == (0, one.images_used, 3)
@@ -449,6 +457,13 @@ for call, *given in (
       for name, value in (("mask", keep), ("mask", [True] * 9), ("kind", "points"))),
     *((lambda values: jaxcal.calibrate(dataclasses.replace(problem, poses=values), "conventional"),
        values) for values in (poses.swapaxes(1, 2), -poses, poses * np.array([-1.0, 1, 1, 1]))),
+    (mapping.image_points, [[0.0, 20.0, 1.0]]), (mapping.image_points, "a"),
+    (lambda names: jaxcal.ImageTransform(np.eye(4), unknowns=names),
+     ("translation", "rotation", "delay", "scale")),
+    (found.with_problem, images), (found.with_problem, problem),
+    (jax.jit(lambda value: jaxcal.Options(tolerance_mm=value) and value), 0.1),
+    *((lambda names, call=call: call(problem, estimate=names), [["scale"]])
+      for call in (jaxcal.calibrate, jaxcal.calibrate_closed_form)),
 ):
     try:
         call(*given)
@@ -460,7 +475,7 @@ for call, *given in (
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stderr == ""
     lines = done.stdout.splitlines()
-    assert len(lines) == 220
+    assert len(lines) == 228
     assert lines[0].startswith("jaxcal.calibrate takes a problem, not a path: ")
     assert lines[3].startswith("jaxcal.calibrate_batch takes a problem or a recording, not int: ")
     assert lines[4] == "points must have shape (..., 2), not (1, 3)"

@@ -35,7 +35,7 @@ from jaxcal.model.outlying import stands_out
 from jaxcal.model.parameters import Parameters, retract
 from jaxcal.model.residuals import target_in_image
 from jaxcal.model.thresholds import FEWEST_IMAGES
-from jaxcal.result.calibration import Status, check_one, status_names
+from jaxcal.result.calibration import OneOrBatch, Status, check_one, status_names
 from jaxcal.runtime import compiler, executables
 from jaxcal.runtime.array_types import AnyArray
 from jaxcal.runtime.arrays import first_images, is_traced
@@ -55,7 +55,7 @@ _LARGEST_SD_MM = 1.0
 """A tip known less well serves no calibration; a tool that is hardly turned has such a one."""
 
 
-class Pivot(eqx.Module):
+class Pivot(OneOrBatch, eqx.Module):
     """A pivot calibration (or a batch, with leading axes).
 
     Attributes:
@@ -201,8 +201,8 @@ def calibrate_pivot(
 
     Args:
         poses: tool -> tracker, mm, (n, 4, 4) or (n, 3, 4), in the order in which they were taken;
-            concrete ones are checked and their rotations projected to SO(3). Leading axes make a
-            batch, which is solved as it is.
+            concrete ones, with a mask that is no traced array, are checked and their rotations
+            projected to SO(3). Leading axes make a batch, which is solved as it is.
         mask: True (or 1) for poses to use; all by default. Of concrete poses, not of a batch, those
             that repeat an earlier one exactly are not used.
         robust: find the poses that agree with each other, even if nearly half of all poses are
@@ -221,11 +221,13 @@ def calibrate_pivot(
     shape = np.shape(poses)
     if len(shape) < 3 or shape[-2:] not in ((4, 4), (3, 4)):
         raise InputError(f"poses must have shape (n, 4, 4), not {shape}")
+    if not shape[-3]:
+        raise InputError(f"0 poses are too few: at least {MINIMUM_IMAGES} are needed")
     if mask is not None and not is_traced(mask):
         mask = truth_array(mask, "mask")
     if mask is not None and np.shape(mask) not in (shape[:-2], shape[-3:-2]):
         raise InputError(f"mask must have shape {shape[:-2]}, not {np.shape(mask)}")
-    if not is_traced(poses) and np.ndim(poses) == 3:
+    if not is_traced(poses, mask) and np.ndim(poses) == 3:
         used = np.ones(len(poses), bool) if mask is None else np.asarray(mask) > 0
         poses = check_poses(real_array(poses, "poses"), used)
         mask = used & _first_of_each(poses, used)

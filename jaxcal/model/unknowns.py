@@ -252,14 +252,19 @@ def further_derivatives(
 
 
 def unknown_names(estimate: Any) -> tuple[str, ...]:
-    """Names of further unknowns as a tuple; a text may hold one name or several with commas."""
+    """Names of further unknowns as a tuple; a text may hold one name or several with commas.
+
+    Raises:
+        InputError: something else than names.
+    """
     if isinstance(estimate, str):
         return tuple(name.strip() for name in estimate.split(","))
     if estimate is None:
         return ()
-    if not isinstance(estimate, Iterable):
+    names = tuple(estimate) if isinstance(estimate, Iterable) else (estimate,)
+    if not all(isinstance(name, str) for name in names):
         raise InputError(f"estimate must be names of unknowns, not {shown(estimate)}")
-    return tuple(estimate)
+    return names
 
 
 def count_unknowns(blocks: Blocks) -> int:

@@ -6,7 +6,7 @@ import enum
 import os
 from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from jaxcal.runtime.arrays import (
     outline,
     static,
 )
+from jaxcal.runtime.given_values import check_made
 from jaxcal.solvers.convergence import Convergence
 
 if TYPE_CHECKING:
@@ -139,8 +140,60 @@ class Linearisation:
     prior_sd: Float[AnyArray, "*batch priors"] | None = None
 
 
+Answer = TypeVar("Answer", bound="OneOrBatch")
+
+
+class OneOrBatch:
+    """An answer about one problem, or a batch of them, with an array ``mask`` of (*batch, n)."""
+
+    mask: Any
+
+    def __getitem__(self: Answer, index: Any) -> Answer:
+        """Some answers of a batch.
+
+        Raises:
+            IndexError: beyond the batch.
+            InputError: for one answer, so that a loop over it does not end silently; a traced
+                index.
+        """
+        self._check_batch()
+        if is_traced(index):
+            raise InputError("a batch is not indexed by traced numbers: index each of its arrays")
+        given = index if isinstance(index, tuple) else (index,)
+        # JAX takes no lists.
+        given = tuple(np.asarray(each) if isinstance(each, list) else each for each in given)
+        axes = self.mask.ndim - 1
+        # Numpy raises an error for an index outside the batch; JAX would clip it.
+        np.empty(self.mask.shape[:-1])[given]
+
+        def taken(leaf: AnyArray) -> AnyArray:
+            # With all the other axes named, an ellipsis in the index stands for the batch's only.
+            part = leaf[(*given, *(slice(None),) * (leaf.ndim - axes))]
+            # An element of a numpy array is a scalar, not an array.
+            return np.asarray(part) if isinstance(leaf, np.ndarray) else part
+
+        return map_arrays(taken, self)
+
+    def __len__(self) -> int:
+        """Number of answers along the first axis of a batch.
+
+        Raises:
+            InputError: for one answer.
+        """
+        self._check_batch()
+        return self.mask.shape[0]
+
+    def __bool__(self) -> bool:
+        """True, also for an empty batch, and for one answer, which has no length."""
+        return True
+
+    def _check_batch(self) -> None:
+        if self.mask.ndim == 1:
+            raise InputError("this is one calibration, not a batch of them: it has no parts")
+
+
 @array_tree
-class Calibration:
+class Calibration(OneOrBatch):
     """A calibration of one problem, or of a batch (then every array has the batch axes in front).
 
     Units are mm and rad. Perturbations of X are right perturbations, X Exp([v, omega]), so they are
@@ -450,42 +503,18 @@ class Calibration:
 
         return observability(self)
 
-    def __getitem__(self, index: Any) -> Calibration:
-        """Some calibrations of a batch.
-
-        Raises:
-            IndexError: beyond the batch.
-            InputError: for one calibration, so that a loop over it does not end silently.
-        """
-        self._check_batch()
-        # Numpy raises an error for an index outside the batch; JAX would clip it.
-        np.empty(self.mask.shape[:-1])[index]
-
-        def taken(leaf: AnyArray) -> AnyArray:
-            # An element of a numpy array is a scalar, not an array.
-            return np.asarray(leaf[index]) if isinstance(leaf, np.ndarray) else leaf[index]
-
-        return map_arrays(taken, self)
-
-    def __len__(self) -> int:
-        """Number of calibrations along the first axis of a batch.
-
-        Raises:
-            InputError: for one calibration.
-        """
-        self._check_batch()
-        return self.mask.shape[0]
-
-    def __bool__(self) -> bool:
-        """True, also for an empty batch, and for one calibration, which has no length."""
-        return True
-
-    def _check_batch(self) -> None:
-        if self.mask.ndim == 1:
-            raise InputError("this is one calibration, not a batch of them: it has no parts")
-
     def with_problem(self, problem: Problem) -> Calibration:
-        """The same calibration with the data that were solved."""
+        """The same calibration with the data that were solved.
+
+        Raises:
+            InputError: something else than a problem, or one with another number of images.
+        """
+        check_made("problem", problem, Problem, "jaxcal.Problem.from_recording or from_arrays")
+        if problem.mask.shape != self.mask.shape:
+            raise InputError(
+                f"problem must hold the images of this calibration: its mask has shape "
+                f"{problem.mask.shape}, not {self.mask.shape}"
+            )
         return replace(self, problem=problem)
 
     def image_transform(self) -> ImageTransform:

@@ -124,8 +124,11 @@ class ImageTransform:
     def __post_init__(self) -> None:
         moving = [name for name in TABLE if TABLE[name].in_image]
         blocks = tuple(self.unknowns) if isinstance(self.unknowns, tuple | list) else ()
-        if blocks[:2] != ("translation", "rotation") or not set(blocks) <= set(moving):
-            raise InputError(f"unknowns must be translation, rotation and others of {moving}")
+        known = tuple(name for name in moving if name in blocks)
+        if blocks[:2] != ("translation", "rotation") or blocks != known:
+            raise InputError(
+                f"unknowns must be translation, rotation and others of {moving}, in this order"
+            )
         size = len(tangent_names(blocks))
         shapes = {
             "image_plane_to_probe": (4, 4),
@@ -335,10 +338,7 @@ class ImageTransform:
         Raises:
             InputError: another shape, NaN or numbers over 1e9.
         """
-        measured = real_array(pixels, "pixels")
-        measured = measured[None] if measured.ndim == 1 else measured
-        if measured.ndim != 2 or measured.shape[1] != 2:
-            raise InputError(f"pixels must have shape (n, 2), not {measured.shape}")
+        measured = _image_points(pixels, "pixels")
         # Written so that NaN is refused, too.
         if not (np.abs(measured) <= _LARGEST).all():
             raise InputError(f"pixels must be numbers up to {_LARGEST:g}, not NaN or Inf")
@@ -354,7 +354,11 @@ class ImageTransform:
 
         Returns:
             (n, 2) [u, v] px, or [lateral, range] mm where there are no pixels.
+
+        Raises:
+            InputError: another shape, or what are no numbers.
         """
+        places = _image_points(places, "places")
         return (places - np.array([0.0, self.face_offset_mm])) / self._mm_per_px()
 
     def pixel_size_mm(self) -> Float[np.ndarray, " 2"]:
@@ -425,6 +429,14 @@ def _numbers(value: Any, name: str, shape: tuple[int, ...]) -> np.ndarray:
     if array.shape != shape:
         raise InputError(f"{name} must have shape {shape}, it has {array.shape}")
     return array
+
+
+def _image_points(value: Any, name: str) -> Float[np.ndarray, "n 2"]:
+    """One point of an image or many, as rows."""
+    points = np.atleast_2d(real_array(value, name))
+    if points.ndim != 2 or points.shape[1] != 2:
+        raise InputError(f"{name} must have shape (n, 2), not {np.shape(value)}")
+    return points
 
 
 def _checked(values: dict[str, np.ndarray]) -> Float[np.ndarray, "4 4"]:

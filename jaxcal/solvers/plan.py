@@ -92,6 +92,8 @@ class Options:
         tiny = np.finfo(float).tiny
         for name, unit in _TOLERANCES.items():
             value = getattr(self, name)
+            if is_traced(value):
+                raise InputError(f"{name} is part of the compiled program: it cannot be traced")
             check_size(name, value, tiny, unit=unit)
             object.__setattr__(self, name, float(value))
         for name in ("max_rounds", "inner_steps", "max_iterations", "trace"):
