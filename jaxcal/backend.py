@@ -52,7 +52,7 @@ from jaxcal.model.residuals import (
     measurement_residual,
     target_in_image,
 )
-from jaxcal.model.unknowns import RIGID, Blocks, count_unknowns
+from jaxcal.model.unknowns import RIGID, Blocks, count_unknowns, free_unknowns
 from jaxcal.solvers.general import LevenbergMarquardt, arrow_least_squares
 from jaxcal.solvers.implicit import implicit_tangent
 from jaxcal.solvers.levenberg_marquardt import Minimum, minimise
@@ -100,11 +100,14 @@ def initial_fit(problem: Problem, blocks: Blocks = RIGID) -> Parameters:
 
     Args:
         problem: one problem (vmap for a batch).
-        blocks: the free unknowns.
+        blocks: the free unknowns: :data:`RIGID`, then ``scale``, ``sound-speed`` and ``delay``, as
+            far as they are free.
 
     Raises:
-        InputError: something else than one problem, or pixels of an unknown size that is not free.
+        InputError: something else than one problem, pixels of an unknown size that is not free, or
+            other unknowns.
     """
+    blocks = free_unknowns(blocks)
     if not isinstance(problem, Problem) or problem.batch_shape:
         raise InputError(
             "initial_fit takes one problem: jaxcal.Problem.from_recording makes one, "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import conftest
 import jax
@@ -210,6 +211,19 @@ def test_what_the_pieces_cannot_take_is_said_in_a_sentence():
     for call, said in (
         (lambda: backend.initial_fit(batch), "takes one problem"),
         (lambda: backend.initial_fit(pixels), "the pixels have no spacing_mm"),
+        *(
+            (lambda call=call, blocks=blocks: call(blocks), said)
+            for call in (
+                partial(backend.initial_fit, one),
+                partial(backend.Iterate.of, jax.tree.map(lambda a: a[None], somewhere)),
+            )
+            for blocks, said in (
+                (("scale", *backend.RIGID), "in this order"),
+                ((*backend.RIGID, "delay", "sound-speed"), "in this order"),
+                (("translation", "rotation"), "in this order"),
+                ((*backend.RIGID, "shear"), "'shear' is no unknown"),
+            )
+        ),
         (lambda: backend.ImagePlanes.of(one), "a batch with one leading axis"),
         *(
             (

@@ -25,6 +25,7 @@ from jaxcal.model.unknowns import (
     RIGID_UNKNOWNS,
     Blocks,
     count_unknowns,
+    free_unknowns,
     further_slice,
     step_between,
     stepped,
@@ -184,8 +185,10 @@ class Iterate(eqx.Module):
         """From parameters with a leading axis.
 
         Raises:
-            InputError: parameters of one problem, or with more axes.
+            InputError: parameters of one problem, or with more axes; other unknowns than those of
+                Eq. 7 and further ones, in the table's order.
         """
+        blocks = free_unknowns(blocks)
         if parameters.point.ndim != 2:
             raise InputError(
                 "parameters with one leading axis are needed, e.g. of jax.vmap(initial_fit); the "

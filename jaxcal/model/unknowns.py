@@ -279,6 +279,20 @@ def count_unknowns(blocks: Blocks) -> int:
     return sum(TABLE[name].size for name in blocks)
 
 
+def free_unknowns(blocks: Any) -> Blocks:
+    """The free unknowns of a solve: those of Eq. 7, then further ones in the table's order.
+
+    Raises:
+        InputError: other names, or another order.
+    """
+    names = unknown_names(blocks)
+    count_unknowns(names)
+    wanted = RIGID + tuple(name for name in FURTHER if name in names)
+    if names != wanted:
+        raise InputError(f"the free unknowns must be {wanted}, in this order, not {names}")
+    return names
+
+
 def block_slice(blocks: Blocks, name: str) -> slice:
     """Where a block lies in the tangent vector of the given blocks."""
     start = count_unknowns(blocks[: blocks.index(name)])
