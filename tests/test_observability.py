@@ -127,6 +127,14 @@ def test_a_narrow_cone_is_weak_but_solved():
     assert "translation" in result.observability["weakest_direction"]
 
 
+def test_sds_that_determine_nothing_to_rounding_are_told():
+    """The status was ``converged`` beside a covariance of NaN."""
+    data = problem(3, images=16, noise_mm=0.1)
+    result = jaxcal.calibrate(data, prior="gaussian", sigma=(1e-6, 1e-6, 1e6))
+    assert result.status == "unobservable"
+    assert not result.differentiable
+
+
 def test_what_only_the_bound_fixes_is_said():
     data = problem(3, images=12, elevation_mm=0.5, noise_mm=0.2)
     for bound, held in ((10.0, "interval"), (0.2, "images are at the bound")):

@@ -332,7 +332,7 @@ def inverse_and_observability(
     matrices = [information + ridge, unweighted - floor * eye]
     inverse, log_determinant = inverse_batch_last(jnp.concatenate(matrices, axis=-1))
     inverse = inverse[..., :count]
-    observable = jnp.isfinite(log_determinant[count:])
+    positive, observable = jnp.isfinite(log_determinant).reshape(2, count)
 
     def exceeding() -> Bool[Array, " batch"]:
         return jnp.isfinite(inverse_batch_last(weighted - least * eye)[1])
@@ -345,6 +345,8 @@ def inverse_and_observability(
     degenerate = jnp.logical_not(observable)
     # With nearly exact data the limit is below rounding, and then no direction counts as weak.
     below = jnp.logical_not(exceeds) & (bounded | (eps * total < least))
+    # SDs so different that the matrix is singular to rounding determine nothing either.
+    below = below | jnp.logical_not(positive)
     found = Observability(
         degenerate=degenerate, weak=below & (not bounded), singular=degenerate | (below & bounded)
     )
