@@ -52,7 +52,7 @@ prior of the uniform laws costs accuracy where offsets are triangular, and where
 
 @array_tree
 class OffsetLaw:
-    """What was found out about the offsets and the noise.
+    """What was found out about the offsets and the noise; zeros where nothing was weighed.
 
     Attributes:
         probability: of the families uniform, bell, gaussian and student, in this order.

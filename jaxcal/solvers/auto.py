@@ -155,11 +155,11 @@ def average_over_laws(
         return jnp.where(enough, value, 0.0)
 
     law = OffsetLaw(
-        probability=(member @ weight).T,
+        probability=where_weighed(member @ weight).T,
         mean=where_weighed(model.mean + step[-1]),
         mean_sd=where_weighed(jnp.sqrt(jnp.maximum(covariance[-1, -1], 0.0))),
         mean_probability=where_weighed(jnp.sum(answers.weight * answers.mean_probability, axis=0)),
-        trust=model.trust,
+        trust=where_weighed(model.trust),
         own_probability=where_weighed(own),
         weighed=enough,
     )
