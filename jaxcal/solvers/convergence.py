@@ -10,6 +10,9 @@ from jaxcal.runtime.arrays import array_tree
 class Convergence:
     """How the method ended. Of these numbers the cost alone has a derivative.
 
+    If distributions of the offsets were compared (priors ``auto`` and ``uniform``), all of them are
+    about the Gaussian solution at which the comparison began; the average has no objective.
+
     Attributes:
         cost: the minimised sum of squares, mm^2 (equal weights) or whitened.
         stationarity: scaled KKT residual of that objective.
