@@ -456,6 +456,16 @@ def test_batches_give_the_same_answers(few):
     assert relaxed > 0
 
 
+def test_neighbours_in_a_batch_change_no_digit():
+    """A problem that was solved took further steps while others were not."""
+    easy = [drawn(seed, 5, noise=0.1) for seed in range(6)]
+    hard = [drawn(seed, 5, noise=10.0, offset=5.0) for seed in range(6)]
+    answers = [solve_batch(problems_of(easy + other), (), few=0) for other in (easy, hard)]
+    for name in ("image_to_probe", "point_mm", "gap_mm2"):
+        one, other = (getattr(answer, name)[:6] for answer in answers)
+        np.testing.assert_array_equal(one, other)
+
+
 def test_a_list_of_any_size_compiles_nothing():
     compiled = []
 

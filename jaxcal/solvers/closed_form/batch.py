@@ -250,7 +250,7 @@ def _optimum(
     if not constraints.free:
         # With these multipliers |x| is at most 1, so they lie far inside.
         inside = inside.at[:2].set(jnp.sqrt(jnp.sum(vector**2, axis=0)))
-    count = vector.shape[1]
+    count, met = vector.shape[1], MET * jnp.finfo(vector.dtype).eps
 
     def evaluate(values: Array) -> tuple[Array, Array, Array]:
         factor, pivots = unrolled.cholesky(_with_multipliers(constraints, matrix, values))
@@ -267,7 +267,8 @@ def _optimum(
         index, values, step, x, off = state
         trial = values + step
         new_x, new_step, new_off = evaluate(trial)
-        better = new_off < off
+        # A problem that is solved stays as it is, however long the others take.
+        better = (new_off < off) & (off > met)
         # Comparisons with NaN are false, so a trial outside is not better.
         outside_at_first = (index == 0) & ~better
         step = jnp.where(better, new_step, SHORTER * step)
@@ -284,7 +285,7 @@ def _optimum(
 
     def unfinished(state: tuple) -> Bool[Array, ""]:
         index, _, _, _, off = state
-        return (index < NEWTON_STEPS) & jnp.any(off > MET * jnp.finfo(off.dtype).eps)
+        return (index < NEWTON_STEPS) & jnp.any(off > met)
 
     state = (
         jnp.zeros((), jnp.int32),
