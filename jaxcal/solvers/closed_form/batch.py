@@ -332,12 +332,7 @@ def _feasible(
     pair = x.reshape(2, 3, -1)
     lengths = jnp.sqrt(jnp.sum(pair**2, axis=1))
     lateral, axial = orthonormal_pair(pair[0] / lengths[0], pair[1] / lengths[1])
-    one = jnp.ones_like(lengths[0])
-    first, second = {
-        (): (one, one),
-        ("common",): (0.5 * (lengths[0] + lengths[1]),) * 2,
-        ("axial",): (one, lengths[1]),
-    }.get(constraints.free, (lengths[0], lengths[1]))
+    first, second = constraints.allowed(lengths)
     return jnp.concatenate([first * lateral, second * axial])
 
 

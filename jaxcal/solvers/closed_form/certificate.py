@@ -131,4 +131,4 @@ def _factors(
             "a common scale is one factor on lateral and axial spacing, and these are two: "
             'estimate=("scale",) has two'
         )
-    return constraints.allowed(factors)
+    return np.asarray(constraints.allowed(factors))

@@ -39,7 +39,8 @@ import numpy as np
 from jaxcal import InputError
 from jaxcal.data.problem import Problem
 from jaxcal.data.recording import MINIMUM_IMAGES
-from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.array_types import AnyArray, Float
+from jaxcal.runtime.arrays import array_module
 
 RANK_TOLERANCE = 1e-11
 """Singular values below this share of the largest possible one count as zero."""
@@ -80,12 +81,14 @@ class QuadraticConstraints:
         """Whether pixel sizes are unknown; they do not stretch the range of row 0."""
         return bool({"lateral", "common"} & set(self.free))
 
-    def allowed(self, lengths: Float[np.ndarray, " 2"]) -> Float[np.ndarray, " 2"]:
+    def allowed(self, lengths: Float[AnyArray, "2 ..."]) -> Float[AnyArray, "2 ..."]:
         """The lengths of a1 and a3 that the constraints allow, nearest to the given ones."""
+        xp = array_module(lengths)
+        one, mean = xp.ones_like(lengths[0]), 0.5 * (lengths[0] + lengths[1])
         return {
-            (): np.ones(2),
-            ("common",): np.full(2, lengths.mean()),
-            ("axial",): np.array([1.0, lengths[1]]),
+            (): xp.stack([one, one]),
+            ("common",): xp.stack([mean, mean]),
+            ("axial",): xp.stack([one, lengths[1]]),
         }.get(self.free, lengths)
 
 
