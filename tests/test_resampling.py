@@ -87,6 +87,7 @@ def test_many_images_are_held_out_several_at_a_time(data, whole, monkeypatch):
     monkeypatch.setattr(resampling, "MOST_FOLDS", COUNT - 1)
     found = cross_validate(data, result=whole, **CONVENTIONAL)
     assert found.converged.all()
+    assert found.converged.dtype == bool
     assert found.converged.shape == (COUNT - 1,)
     np.testing.assert_array_equal(found.moved[0], found.moved[COUNT - 1])
 

@@ -208,6 +208,9 @@ def calibrate_pivot(
         robust: find the poses that agree with each other, even if nearly half of all poses are
             wrong, and leave the others out.
 
+    Returns:
+        A :class:`Pivot`; read its ``status`` and ``warnings`` before using it.
+
     Raises:
         InputError: poses or a mask of another shape, or what are no numbers; concrete poses, not
             of a batch, that are not rigid transforms or look like metres, or fewer than 4 used

@@ -91,7 +91,7 @@ class CrossValidation(eqx.Module):
     moved: Float[AnyArray, "n 6"]
     influence: Float[AnyArray, " n"]
     image_to_probe: Float[AnyArray, "folds 4 4"]
-    converged: Float[AnyArray, " folds"]
+    converged: Bool[AnyArray, " folds"]
     fold_cost: Float[AnyArray, " n"]
     mask: Float[AnyArray, " n"]
     image_moved: Float[AnyArray, " n"]
@@ -103,7 +103,7 @@ class Bootstrap(eqx.Module):
 
     Attributes:
         image_to_probe: (k, 4, 4) X of each resample.
-        converged: (k,) 1 where the resample has at least four different images, as every
+        converged: (k,) whether the resample has at least four different images, as every
             calibration needs, and its solve converged; the following use only those.
         spread: (6,) SD of X about the X of all images, [v, omega], mm and rad. It is computed from
             medians, so a few resamples with too few different images do not spoil it.
@@ -115,7 +115,7 @@ class Bootstrap(eqx.Module):
     """
 
     image_to_probe: Float[AnyArray, "k 4 4"]
-    converged: Float[AnyArray, " k"]
+    converged: Bool[AnyArray, " k"]
     spread: Float[AnyArray, " 6"]
     reproducibility: Float[AnyArray, " m"]
     rms_scatter: Float[AnyArray, " m"]
@@ -205,7 +205,7 @@ def _compared(
         moved=moved,
         influence=_length_in_sds(moved, result.covariance),
         image_to_probe=fits.image_to_probe,
-        converged=xp.asarray(fits.converged, mask.dtype),
+        converged=xp.asarray(fits.converged),
         fold_cost=held.cost,
         mask=mask,
         image_moved=image_moved,
@@ -326,22 +326,23 @@ def _scatter(
             it may fit perfectly far from the truth.
     """
     problem, result, fits, xp = _plain(problem, result, fits)
-    converged = xp.asarray(fits.converged & enough, problem.mask.dtype)
+    converged = xp.asarray(fits.converged & enough)
+    weight = converged.astype(problem.mask.dtype)
     whole, drawn = result.image_to_probe, fits.image_to_probe
-    moved = xp.where(converged[:, None] > 0, xp.abs(relative_twist(whole, drawn)), xp.nan)
+    moved = xp.where(converged[:, None], xp.abs(relative_twist(whole, drawn)), xp.nan)
     # Where none converged, numpy would warn.
     unknown = xp is np and not converged.any()
     spread = moved[0] if unknown else xp.nanmedian(moved, axis=0)
     points = _box_points(problem, result)
     # A resample that did not converge may hold NaN, which a weight of zero does not remove.
     found = _from_full_image(fits, result, problem)
-    transforms = xp.where(converged[:, None, None] > 0, found, whole)
+    transforms = xp.where(converged[:, None, None], found, whole)
     return Bootstrap(
         image_to_probe=drawn,
         converged=converged,
         spread=MAD * spread,
-        reproducibility=distance_from_mean(transforms, points, converged),
-        rms_scatter=rms_from_mean(transforms, points, converged),
+        reproducibility=distance_from_mean(transforms, points, weight),
+        rms_scatter=rms_from_mean(transforms, points, weight),
         image_points=points,
     )
 
@@ -349,10 +350,10 @@ def _scatter(
 def relative_twist(
     first: Float[AnyArray, "4 4"], second: Float[AnyArray, "*k 4 4"]
 ) -> Float[AnyArray, "*k 6"]:
-    """[v, omega] that take the first transform to the second: first Exp([v, omega]), mm and rad.
+    """The step [v, omega] from the first transform to the second, mm and rad.
 
-    It is exact for v. The error of omega is of third order; a calibration moves by fractions of a
-    degree, so it does not count.
+    It is the step of :func:`jaxcal.model.parameters.retract`, exact for v. The error of omega is of
+    third order; a calibration moves by fractions of a degree, so it does not count.
     """
     xp = array_module(first, second)
     back = first[:3, :3].T
