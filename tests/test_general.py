@@ -200,6 +200,18 @@ def test_shared_and_local_unknowns_are_those_of_a_dense_solver(arrow, points, li
         np.testing.assert_allclose(forward, (ends[0] - ends[1]) / (2 * step), rtol=1e-5)
 
 
+@pytest.mark.parametrize("start", [5.0, -5.0])
+def test_local_unknowns_that_begin_beyond_their_limit_end_on_it(start):
+    """They stayed where they were, and the solve failed."""
+
+    def residual(shared, local, args):
+        return jnp.stack([local - 10.0, shared[0] - 1 + 0 * local], axis=1)
+
+    shared, local = arrow_least_squares(residual, jnp.zeros(1), jnp.full(3, start), limit=1.0).value
+    np.testing.assert_allclose(shared, 1.0, atol=1e-9)
+    np.testing.assert_array_equal(local, 1.0)
+
+
 def test_what_the_pieces_cannot_take_is_said_in_a_sentence():
     one = jaxcal.Problem.from_recording(
         jaxcal.simulate_recording(jaxcal.Protocol(images=12), seed=1)

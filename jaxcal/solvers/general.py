@@ -201,7 +201,7 @@ def arrow_least_squares(
     Args:
         residual: from (shared, local, args) to (n, columns); row i depends on local[i] only.
         shared: first value of the shared unknowns, any pytree of floating arrays.
-        local: first value of the local unknowns, one a row.
+        local: first value of the local unknowns, one a row; taken to the bound where it is beyond.
         args: passed to the residuals; the solution is differentiable with respect to it, by
             optimistix's implicit derivatives.
         limit: bound on the magnitude of the local unknowns; inf where there is none.
@@ -232,6 +232,8 @@ def arrow_least_squares(
         got = f"an array of shape {shape}" if shape is not None else f"a {type(made).__name__}"
         raise InputError(f"residual must return a ({rows or 'n'}, columns) array, not {got}")
     bound = _bound(limit, rows).astype(flat.dtype)
+    # A step clips what it moves, and one beyond its bound would be held there.
+    first = (flat, jnp.clip(first[1], -bound, bound))
     function = _FlatResidual(residual, unravel)
     if not is_traced((shared, local, args)):
         _check_locality(function, first, args)
