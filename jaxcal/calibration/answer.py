@@ -28,6 +28,7 @@ from jaxcal.data.problem import Problem
 from jaxcal.data.recording import MINIMUM_IMAGES
 from jaxcal.diagnostics.uncertainty import (
     LARGEST_SD,
+    component_freedom,
     covariance_by_axis,
     mm_at_target,
     threshold,
@@ -408,8 +409,7 @@ def _residual_sds(
 ) -> Float[Array, "*batch 3"]:
     """SDs of lateral position, range and offset, mm, from the residuals of a fit in mm."""
     used = jnp.sum(errors.mask, axis=-1)
-    # The unknowns' degrees of freedom are shared equally by the three components.
-    freedom = jnp.maximum(used - count_unknowns(blocks) / 3, 1.0)
+    freedom = component_freedom(used, blocks)
     distance = jnp.sqrt(errors.q[1] ** 2 + errors.q[2] ** 2)
     lateral, axial = (
         jnp.sum(errors.mask * error**2, axis=-1) / freedom

@@ -21,6 +21,7 @@ from jaxcal.data.problem import Problem
 from jaxcal.diagnostics.image_errors import ImageErrors
 from jaxcal.diagnostics.uncertainty import (
     LARGEST_SD,
+    component_freedom,
     covariance_by_axis,
     inverses,
     mm_at_target,
@@ -99,10 +100,7 @@ def _with_uncertainty(found: ClosedForm, problem: Problem, plan: SolvePlan) -> C
         image_to_probe=found.image_to_probe,
         point=found.point_mm,
         elevation=np.where(seen.mask[0] > 0, seen.q[0, :, 1], 0.0),
-        # Every kind of errors has n - p/3 degrees of freedom.
-        sigma=np.sqrt(
-            (seen.errors[0] ** 2).sum(axis=0) / max(used - count_unknowns(blocks) / 3, 1)
-        ),
+        sigma=np.sqrt((seen.errors[0] ** 2).sum(axis=0) / component_freedom(used, blocks)),
         offset_law=None,
         channel_sigma=None,
         unknowns_covariance=covariance,

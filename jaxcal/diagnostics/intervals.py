@@ -32,8 +32,9 @@ import numpy as np
 from scipy import special
 
 from jaxcal import InputError
+from jaxcal.diagnostics.uncertainty import component_freedom
 from jaxcal.model.image_points import mean_of_squares, point_jacobian
-from jaxcal.model.unknowns import TINY, Values, count_unknowns, in_image, measured, split_further
+from jaxcal.model.unknowns import TINY, Values, in_image, measured, split_further
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import AnyArray, Float
 from jaxcal.runtime.arrays import array_module, is_traced
@@ -80,7 +81,7 @@ def degrees_of_freedom(calibration: Calibration) -> Float[AnyArray, "*batch"]:
     _check(calibration)
     xp = array_module(calibration)
     used = xp.sum(xp.asarray(calibration.mask) > 0, axis=-1)
-    left = xp.asarray(xp.maximum(used - count_unknowns(calibration.blocks) / 3, 1.0))
+    left = xp.asarray(component_freedom(used, calibration.blocks))
     if calibration.prior not in TUNED:
         return left
     return xp.where(calibration.sigma_tuned, left, np.inf)

@@ -30,7 +30,7 @@ import numpy as np
 
 from jaxcal.diagnostics.image_errors import ImageErrors, Whitened, quadratic
 from jaxcal.model.arc import OnArc
-from jaxcal.model.unknowns import TABLE, Blocks, block_slice
+from jaxcal.model.unknowns import TABLE, Blocks, block_slice, count_unknowns
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import AnyArray, Bool, Float
 from jaxcal.runtime.arrays import array_module
@@ -150,6 +150,18 @@ class Spectra:
             weakest = np.where(degenerate[:, None], nearest_unknown(unseen, null), weakest)
         sd = np.where(unknown, np.nan, np.sqrt(variance / smallest))
         return cls(values[:, -1] / smallest, weakest, sd)
+
+
+def component_freedom(used: Any, blocks: Blocks) -> Any:
+    """Degrees of freedom of lateral errors, of range errors and of offsets, (*batch).
+
+    The unknowns take a third of theirs from each of the three.
+
+    Args:
+        used: number of images, (*batch).
+        blocks: the free unknowns.
+    """
+    return array_module(used).maximum(used - count_unknowns(blocks) / 3, 1.0)
 
 
 def rounding(used: Float[AnyArray, "*batch"], lever: Float[AnyArray, "*batch"]) -> Any:
