@@ -30,7 +30,7 @@ def _batch_of_one(
 
 
 def measured_points(parameters: Parameters, problem: Problem) -> Float[Array, "n 2"]:
-    """Lateral position and range of every image, mm.
+    """Lateral position and range of every image, mm; without meaning where left out.
 
     Args:
         parameters: X, target and further unknowns.

@@ -323,7 +323,7 @@ class Calibration(OneOrBatch):
 
     @property
     def searched_start(self) -> Bool[AnyArray, "*batch"]:
-        """Whether the closed-form start was unusable, and a search found another one."""
+        """Whether the start was found by trying many rotations."""
         return self.convergence.searched_start
 
     @property

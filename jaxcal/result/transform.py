@@ -38,7 +38,7 @@ from jaxcal.runtime.messages import shown
 SaveFormat = Literal["json", "plus", "slicer", "itk", "ros", "tusrec", "numpy"]
 
 _ROUNDING = 1e-13
-_LARGEST = 1e9
+_LARGEST_PIXEL = 1e9
 """Largest pixel; beyond it nothing is an image, and squares overflow."""
 _LENGTHS = ("image_plane_to_probe", "scale_mm_per_px", "face_offset_mm", "range_factor")
 """What PLUS's matrix is made of, whose numbers other programs take as float32."""
@@ -225,10 +225,10 @@ class ImageTransform:
             raise InputError("the calibration has pixels of its own: no other size is needed")
         scale, origin = real_array(size_mm, "size_mm"), real_array(origin_px, "origin_px")
         good = scale.shape == origin.shape == (2,)
-        if not (good and (scale > 0).all() and (np.abs(origin) <= _LARGEST).all()):
+        if not (good and (scale > 0).all() and (np.abs(origin) <= _LARGEST_PIXEL).all()):
             raise InputError(
                 "a pixel's size must be two positive numbers, its origin two numbers up to "
-                f"{_LARGEST:g}"
+                f"{_LARGEST_PIXEL:g}"
             )
         check_spacing_unit(scale)
         moved = self.image_plane_to_probe.copy()
@@ -279,8 +279,8 @@ class ImageTransform:
         if own.shape not in ((), (2,)):
             raise InputError(f"pixel_sd_px must be one number or two, not of shape {own.shape}")
         # Written so that NaN is refused, too.
-        if not ((own >= 0) & (own <= _LARGEST)).all():
-            raise InputError(f"pixel_sd_px must be from 0 to {_LARGEST:g}")
+        if not ((own >= 0) & (own <= _LARGEST_PIXEL)).all():
+            raise InputError(f"pixel_sd_px must be from 0 to {_LARGEST_PIXEL:g}")
         plane = self.in_plane(pixels)
         count, rotation = len(plane), self.image_plane_to_probe[:3, :3]
         points = plane @ rotation.T + self.image_plane_to_probe[:3, 3]
@@ -340,8 +340,8 @@ class ImageTransform:
         """
         measured = _image_points(pixels, "pixels")
         # Written so that NaN is refused, too.
-        if not (np.abs(measured) <= _LARGEST).all():
-            raise InputError(f"pixels must be numbers up to {_LARGEST:g}, not NaN or Inf")
+        if not (np.abs(measured) <= _LARGEST_PIXEL).all():
+            raise InputError(f"pixels must be numbers up to {_LARGEST_PIXEL:g}, not NaN or Inf")
         plane = np.zeros((len(measured), 3))
         plane[:, [0, 2]] = self._mm_per_px() * measured + np.array([0.0, self.face_offset_mm])
         return plane

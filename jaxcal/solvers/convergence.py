@@ -19,7 +19,9 @@ class Convergence:
         tolerance_met: the method's own stopping rule was met.
         iterations: linearisations (joint, conventional) or rounds (alternating).
         variance_rounds: passes of the self-tuning that updated the SDs; 0 without it.
-        searched_start: the closed-form start was unsound, so a search found another start.
+        searched_start: the start was found by trying many rotations. One problem: no proof was
+            found that the closed form's minimum is the only one. In batches and under
+            transformations, where the start is linear: that was unsound.
         sigma_floored: which SDs are at their floor.
         rotation_change: X's last move in rad (alternating), else 0.
         translation_change: X's last move in mm (alternating), else 0.
