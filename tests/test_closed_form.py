@@ -394,6 +394,25 @@ def test_what_no_certificate_can_be_about_is_refused():
             jaxcal.certify(images, np.eye(4), scale_mm_per_px=scale, estimate=estimate, **more)
 
 
+def test_what_is_no_problem_is_not_certified():
+    """Poses of another kind, put in by ``replace``, were solved and certified; NaN in the spacing
+    ended in numpy's traceback."""
+    problem = jaxcal.Problem.from_recording(drawn(0, 12))
+    poses, turned = np.asarray(problem.poses), np.array([-1.0, 1.0, 1.0, 1.0])
+    for change, said in (
+        ({"poses": poses.swapaxes(1, 2)}, "not a rigid transform"),
+        ({"poses": poses * turned}, "a reflection"),
+        ({"spacing": np.array([np.nan, 1.0])}, "two positive numbers"),
+        ({"spacing": np.array([-1.0, 1.0])}, "two positive numbers"),
+        ({"face_offset": np.array(np.nan)}, "finite"),
+        ({"mask": np.full(12, 0.5)}, "1 .* or 0"),
+    ):
+        wrong = dataclasses.replace(problem, **change)
+        for call in (jaxcal.calibrate_closed_form, lambda given: jaxcal.certify(given, np.eye(4))):
+            with pytest.raises(jaxcal.InputError, match=said):
+                call(wrong)
+
+
 def test_names_to_estimate_are_taken_as_by_calibrate():
     images = drawn(1, 8)
     named = jaxcal.calibrate_closed_form(images, estimate=("sound-speed",))

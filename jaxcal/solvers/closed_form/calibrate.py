@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from jaxcal.data.problem import Problem, as_batch, check_shapes
+from jaxcal.data.problem import Problem, as_batch, check_shapes, check_values
 from jaxcal.data.recording import Images, Recording
 from jaxcal.model.unknowns import unknown_names
 from jaxcal.runtime.arrays import is_traced
@@ -43,4 +43,5 @@ def calibrate_closed_form(
         from jaxcal.solvers.closed_form.batch import solve_batch
 
         return solve_batch(problems, names)
+    check_values(problems)
     return solve_problem(problems, names)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.data.problem import Problem, as_problem
+from jaxcal.data.problem import Problem, as_problem, check_shapes, check_values
 from jaxcal.data.recording import Images, Recording
 from jaxcal.model.unknowns import unknown_names
 from jaxcal.runtime.array_types import AnyArray, Float
@@ -66,6 +66,9 @@ def certify(
     if is_traced(problem, image_to_probe, point, scale_mm_per_px, sound_speed_factor):
         raise InputError("certify is computed by numpy: call it outside of jit, vmap and grad")
     problem = as_problem(problem, "jaxcal.certify", channels=False)
+    check_shapes(problem)
+    if not problem.batch_shape:
+        check_values(problem)
     data, constraints = image_data(problem, unknown_names(estimate))
     reduced = reduce(data, constraints)
     transform = real_array(image_to_probe, "image_to_probe")
