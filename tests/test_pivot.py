@@ -203,6 +203,17 @@ def test_a_mask_may_be_traced_where_the_poses_are_not():
     np.testing.assert_allclose(found, known.tip, atol=1e-9)
 
 
+def test_poses_left_out_are_not_read_in_a_batch_either():
+    poses = np.stack([swung(random_rotations(12, seed), 0.1, seed) for seed in range(2)])
+    used = np.arange(12) < 9
+    whole = jaxcal.calibrate_pivot(poses, used, robust=False)
+    poses[:, 9:] = np.nan
+    found = jaxcal.calibrate_pivot(poses, used, robust=False)
+    np.testing.assert_array_equal(found.tip, whole.tip)
+    np.testing.assert_array_equal(found.covariance, whole.covariance)
+    np.testing.assert_array_equal(found.status, ["converged", "converged"])
+
+
 def test_a_batch_with_a_problem_of_too_few_poses_says_which():
     poses = np.stack([swung(random_rotations(12, seed), 0.1, seed) for seed in range(2)])
     found = jaxcal.calibrate_pivot(poses, np.arange(12) < [[12], [3]], robust=False)

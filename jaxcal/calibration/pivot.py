@@ -306,7 +306,8 @@ def _solve_all(
 
 def _solve(poses: Float[Array, "n 4 4"], mask: Float[Array, " n"], *, robust: bool) -> Pivot:
     everything = Problem(
-        poses=poses,
+        # Poses that are not used may hold anything.
+        poses=jnp.where(mask[:, None, None] > 0, poses, jnp.eye(4, dtype=poses.dtype)),
         measurements=jnp.zeros((*mask.shape, 2), poses.dtype),
         mask=mask,
         spacing=jnp.ones(2, poses.dtype),
