@@ -94,7 +94,9 @@ def _solved(
 
 def agreed_images(problem: Problem, blocks: Blocks) -> Float[Array, " n"]:
     """1 for the used images of one problem that agree with each other."""
-    return find_consensus(jax.lax.stop_gradient(problem), rigid_model(blocks))
+    # A NaN in an image left out would spoil every proposal, and then no image is an outlier.
+    problem = jax.lax.stop_gradient(problem.cleared(problem.mask))
+    return find_consensus(problem, rigid_model(blocks))
 
 
 def solve_one(
