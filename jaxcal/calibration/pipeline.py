@@ -16,9 +16,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxcal.calibration.answer import assemble
+from jaxcal.data.poses import LAST_ROW, LAST_ROW_TOLERANCE, ROTATION_TOLERANCE
 from jaxcal.data.problem import Problem
 from jaxcal.model.batch import ImagePlanes
 from jaxcal.model.unknowns import Blocks
@@ -52,6 +53,7 @@ def solve_problems(
         problems, given = jax.lax.stop_gradient((problems, given))
     sound = (problems.mask == 0) | (problems.mask == 1)
     problems = problems.cleared(problems.mask)
+    sound &= _rigid(problems.poses) & (problems.spacing > 0).all(axis=-1, keepdims=True)
     if (covariance := problems.covariance) is not None:
         sound &= (covariance[..., 0, 0] > 0) & (jnp.linalg.det(covariance) > 0)
     if problems.max_elevation is not None:
@@ -65,8 +67,8 @@ def solve_problems(
             seen = jax.lax.stop_gradient(problems.points_only())
             agreed = jax.vmap(jax.custom_batching.sequential_vmap(search))(seen)
         problems = replace(problems, mask=agreed)
-    # Where a mask holds anything but 0 and 1, or an image has no covariance or bound that could be
-    # one, the problem fails.
+    # Where a mask holds anything but 0 and 1, or an image has no pose, pixel size, covariance or
+    # bound that could be one, the problem fails.
     mask = jnp.where(sound, problems.mask, jnp.nan)
     # A mask is 0 or 1, and has no derivative; that of an image left out would be one of the
     # harmless values.
@@ -79,6 +81,16 @@ def solve_problems(
         return jax.tree.map(lambda leaf: leaf[0], one)
 
     return jax.lax.map(alone, problems)
+
+
+def _rigid(poses: Float[Array, "batch n 4 4"]) -> Bool[Array, "batch n"]:
+    """Whether poses are right-handed rigid transforms, up to what is taken for rounding."""
+    x, y, z = (poses[..., :3, column] for column in range(3))
+    # Axes of length 1 are at right angles, and right-handed, if each is the product of the others.
+    off = jnp.stack([jnp.cross(x, y) - z, jnp.cross(y, z) - x, jnp.cross(z, x) - y], axis=-1)
+    # Errors of two axes, and that of the third, add up.
+    turns = (jnp.abs(off) < 3 * ROTATION_TOLERANCE).all(axis=(-2, -1))
+    return turns & (jnp.abs(poses[..., 3, :] - LAST_ROW) <= LAST_ROW_TOLERANCE).all(axis=-1)
 
 
 def _solved(

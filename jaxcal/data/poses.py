@@ -25,8 +25,11 @@ ROTATION_TOLERANCE = 1e-2
 QUATERNION_TOLERANCE = 1e-2
 """Largest distance of a quaternion's length from 1 that counts as rounding."""
 
-_LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
-_LAST_ROW_TOLERANCE = 1e-6
+LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
+"""Of a 4x4 pose."""
+
+LAST_ROW_TOLERANCE = 1e-6
+"""Largest difference from it, of any number, that counts as rounding."""
 
 
 def targets_in_images(
@@ -105,7 +108,7 @@ def check_poses(
     bad = ~np.isfinite(full).all(axis=(1, 2))
     if bad.any():
         raise InputError(f"{name(int(np.flatnonzero(bad)[0]))} holds NaN or Inf")
-    bad = np.abs(full[:, 3] - _LAST_ROW).max(axis=1) > _LAST_ROW_TOLERANCE
+    bad = np.abs(full[:, 3] - LAST_ROW).max(axis=1) > LAST_ROW_TOLERANCE
     if bad.any():
         row = int(np.flatnonzero(bad)[0])
         raise InputError(
@@ -127,7 +130,7 @@ def check_poses(
             "of a matrix are needed row by row)"
         )
     full[:, :3, :3] = rotations
-    full[:, 3] = _LAST_ROW
+    full[:, 3] = LAST_ROW
     return full
 
 
@@ -140,11 +143,11 @@ def check_affine(matrix: np.ndarray) -> Float[np.ndarray, "4 4"]:
     matrix = real_array(matrix, "the matrix")
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise InputError("the matrix must be 4 x 4 and finite")
-    if np.abs(matrix[3] - _LAST_ROW).max() > _LAST_ROW_TOLERANCE:
+    if np.abs(matrix[3] - LAST_ROW).max() > LAST_ROW_TOLERANCE:
         raise InputError("the matrix's last row is not 0 0 0 1 (a transposed matrix?)")
     if np.linalg.det(matrix[:3, :3]) <= 0:
         raise InputError("the matrix is a reflection, or flat: its determinant is not positive")
-    matrix[3] = _LAST_ROW
+    matrix[3] = LAST_ROW
     return matrix
 
 

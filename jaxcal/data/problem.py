@@ -344,8 +344,8 @@ def stack(problems: list[Problem]) -> Problem:
         the longest; images added to a shorter one come last and are masked out.
 
     Raises:
-        InputError: none at all, something else than problems, or where they differ in what they
-            hold.
+        InputError: none at all, something else than single problems, arrays that do not go
+            together, or where the problems differ in what they hold.
     """
     import jax
     import jax.numpy as jnp
@@ -355,6 +355,9 @@ def stack(problems: list[Problem]) -> Problem:
     for index, problem in enumerate(problems):
         if not isinstance(problem, Problem):
             raise InputError(f"stack takes problems, {index} is {type(problem).__name__}")
+        check_shapes(problem)
+        if problem.batch_shape:
+            raise InputError(f"stack takes single problems, {index} is a batch")
     first = problems[0]
     for index, problem in enumerate(problems):
         if jax.tree.structure(problem) != jax.tree.structure(first):
