@@ -160,6 +160,7 @@ def test_an_orientation_that_is_not_known_is_no_unknown_one(tmp_path, name, stat
         (rb"(Kinds = domain domain list\n)", rb"\1\1"),
         (rb"Kinds = domain domain list\n", b""),
         (rb"UltrasoundImageType = BRIGHTNESS", b"UltrasoundImageType = BRIGHTNESSBRIGHTNESS"),
+        (rb"UltrasoundImageType = BRIGHTNESS", b"UltrasoundImageType = RGB_COLOR"),
         (rb"DimSize = 4 6 5", b"DimSize = 4  6 5              "),
         (rb"Transform = ", b"Transform ="),
         (rb"(Seq_Frame0001_\w+Transform = [^\n]*)", rb"\1 "),

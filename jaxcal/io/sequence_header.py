@@ -154,9 +154,9 @@ def orientation_and_kind(text: str, kind: str) -> tuple[Orientation | None, str]
         PLUS's name of another type. PLUS writes other orientations (``FM``) for RF data alone,
         which are refused as such when asked for.
     """
-    # Missing means B-mode; Slicer writes the word twice.
+    # Missing means B-mode; Slicer writes the word twice. PLUS names B-mode in colour RGB_COLOR.
     kind = kind.strip()
-    if not kind or kind == "XX" or kind.startswith("BRIGHTNESS"):
+    if kind in ("", "XX", "RGB_COLOR") or kind.startswith("BRIGHTNESS"):
         kind = "BRIGHTNESS"
     stated = text.strip().upper()
     # The third letter, the direction of a volume's planes, follows from the others.
