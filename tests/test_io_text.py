@@ -98,6 +98,25 @@ def test_whole_matrices_are_poses_too(pair):
         read_crosswire(*pair[:2])
 
 
+@pytest.mark.parametrize("rows", [12, 16, 4])
+@pytest.mark.parametrize("comma", [",", ", ", ";"])
+def test_a_pair_may_have_a_matrix_in_a_row_and_commas(pair, rows, comma):
+    """As numpy.savetxt and MATLAB's writematrix write arrays of matrices."""
+    poses = pair[2][:, :3] if rows != 16 else pair[2]
+    np.savetxt(pair[0], poses.reshape(-1, rows), delimiter=comma)
+    np.savetxt(pair[1], pair[3], delimiter=comma)
+    images = read_crosswire(*pair[:2], pose_units="cm").calibration
+    np.testing.assert_allclose(images.poses[:, :3, :3], pair[2][:, :3, :3], atol=1e-12)
+    np.testing.assert_allclose(images.poses[:, :3, 3], 10 * pair[2][:, :3, 3], atol=1e-9)
+    np.testing.assert_array_equal(images.measurements, pair[3])
+
+
+def test_a_pair_may_have_decimal_commas(pair):
+    for path in pair[:2]:
+        path.write_text(path.read_text().replace(".", ","))
+    np.testing.assert_allclose(read_crosswire(*pair[:2]).calibration.poses, pair[2], atol=1e-12)
+
+
 def test_crosswire_rows_that_are_not_whole_poses(pair):
     lines = pair[0].read_text().splitlines()
     pair[0].write_text("# comment\n\n" + "\n".join(lines[:-1]))
@@ -113,7 +132,7 @@ def test_crosswire_counts_differ(pair):
 
 
 def test_crosswire_files_exchanged(pair):
-    with pytest.raises(FormatError, match=r"points\.txt:1: 2 columns; 4 are needed"):
+    with pytest.raises(FormatError, match=r"points\.txt:1: 2 columns; 4 or 12 or 16 are needed"):
         read_crosswire(pair[1], pair[0])
 
 

@@ -249,6 +249,9 @@ def test_reading_poses(tmp_path):
     for rows in (quaternions, poses.reshape(5, 16), poses[:, :3].reshape(5, 12)):
         np.savetxt(tmp_path / "poses.txt", rows)
         np.testing.assert_allclose(read_poses(tmp_path / "poses.txt"), poses, atol=1e-12)
+    for stacked in (poses, poses[:, :3]):
+        np.savetxt(tmp_path / "poses.txt", stacked.reshape(-1, 4))
+        np.testing.assert_allclose(read_poses(tmp_path / "poses.txt"), poses, atol=1e-12)
     quaternions[3, 3:] *= 2
     np.savetxt(tmp_path / "poses.txt", quaternions)
     with pytest.raises(jaxcal.FormatError, match=r"poses.txt: quaternion in line 4 has length 2"):

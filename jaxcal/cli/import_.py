@@ -46,8 +46,8 @@ def import_(sources: tuple[str, ...], out: str, add_to: str | None, **options: A
     poses and one with the points; a tracked sequence of PLUS or Slicer (.igs.mha, .igs.mhd,
     .igs.nrrd, .seq.nrrd), or a folder of PNG with --poses, whose frames show the target; such a
     sequence, or an export of NDI ToolBox or Motive, and a file of points (a table with frame or
-    time, u and v, or Slicer's .mrk.json or .fcsv); or POSES (three rows of four numbers for each
-    image) and POINTS (a row "u v" in pixels).
+    time, u and v, or Slicer's .mrk.json or .fcsv); or POSES (for each image three rows of four
+    numbers, or a row of 12 or 16) and POINTS (a row "u v" in pixels).
     docs/reference/formats.md says what each must hold.
     """
     _check(sources, out, add_to, options)

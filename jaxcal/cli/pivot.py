@@ -39,9 +39,9 @@ def pivot(poses: str, no_robust: bool, as_json: bool, **options: Any) -> int:
     """Find the tip of a tracked tool that was turned about its tip.
 
     POSES is a sequence of PLUS or Slicer, an export of NDI ToolBox or Motive, a table (CSV) with a
-    header, or a text file with a row for each pose, tool -> tracker, mm: x y z qx qy qz qw, or the
-    matrix row by row (12 or 16 numbers). Poses that do not fit the rest are left out and named;
-    they are counted from 0, without those that were not tracked.
+    header, or a text file of poses, tool -> tracker, mm: for each a row x y z qx qy qz qw or the
+    matrix row by row (12 or 16 numbers), or three rows of four numbers. Poses that do not fit the
+    rest are left out and named; they are counted from 0, without those that were not tracked.
     """
     import_engine()
     from jaxcal.calibration.pivot import calibrate_pivot

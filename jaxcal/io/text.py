@@ -23,7 +23,8 @@ from jaxcal.data.poses import (
 from jaxcal.data.recording import MINIMUM_IMAGES, Recording, make_images
 from jaxcal.io.columns import CONVERT, LENGTHS_MM, Columns, columns_of_header
 from jaxcal.io.given_files import naming
-from jaxcal.io.table import Table, first_line, parse_numbers, read_table
+from jaxcal.io.lines import text_lines
+from jaxcal.io.table import Table, parse_numbers, read_table
 from jaxcal.runtime.array_types import Float, Int
 from jaxcal.runtime.messages import counted, quoted
 
@@ -216,7 +217,8 @@ def read_crosswire(
 
     Args:
         transforms_path: 3 rows ``R_i0 R_i1 R_i2 t_i`` for each image, i = 0, 1, 2: probe ->
-            tracker; separated by white space. The row 0 0 0 1 may follow in all images.
+            tracker. The row 0 0 0 1 may follow in all images. Or a row of 12 or 16 numbers for each
+            image, the matrix row by row.
         points_path: a row ``u v`` for each image: lateral and axial, px.
         spacing_mm: [lateral, axial] mm per px, when known.
         pose_units: of translations in the file.
@@ -233,36 +235,18 @@ def read_crosswire(
         InputError: poses or pixels that cannot be used (see
         :func:`jaxcal.data.recording.make_images`).
     """
-    transforms = read_table(transforms_path, header=False, separator="")
-    rows = _fixed(
-        transforms,
-        (4,),
-        "3 rotation numbers and a translation, separated by white space; points come second",
-    )
-    matrices = rows.reshape(-1, 4, 4) if len(rows) % 4 == 0 else np.empty((0, 4, 4))
-    edge = [0, 0, 0, 1]
-    # Whole matrices: no row of a rotation is zero.
-    if len(matrices) and (matrices[:, 3] == edge).all():
-        rows = matrices[:, :3].reshape(-1, 4)
-    elif len(matrices) and (matrices[:, :, 3] == edge).all():
-        raise FormatError(
-            f"{transforms.row(3)}: the matrices are transposed: 0 0 0 1 is their last column, and "
-            "should be their last row"
-        )
-    if len(rows) % 3:
-        raise FormatError(
-            f"{transforms.row(-1)}: {len(rows)} rows are not whole poses: each takes 3 rows"
-        )
-    points = read_table(points_path, header=False, separator="")
-    pixels = _fixed(points, (2,), "u and v, separated by white space")
+    transforms = _plain_table(transforms_path)
+    columns = "3 rotation numbers and a translation, or a matrix row by row; points come second"
+    poses, _ = _stacked(transforms, _fixed(transforms, (4, 12, 16), columns))
+    points = _plain_table(points_path)
+    pixels = _fixed(points, (2,), "u and v")
     name = f"{transforms.name} with {points.name}"
-    if len(rows) // 3 != len(pixels):
+    if len(poses) != len(pixels):
         raise FormatError(
-            f"{name}: {len(rows) // 3} poses but {len(pixels)} points: each image has one pose "
-            "(3 rows) and one point (1 row)"
+            f"{name}: {len(poses)} poses but {len(pixels)} points: each image has one pose "
+            "(3 rows R t, or 1 row with the whole matrix) and one point (1 row)"
         )
-    poses = rows.reshape(-1, 3, 4)
-    poses[:, :, 3] *= LENGTHS_MM[pose_units]
+    poses[:, :3, 3] *= LENGTHS_MM[pose_units]
     if invert_poses:
         with naming(transforms_path):
             poses = inverse_poses(check_poses(poses))
@@ -277,11 +261,11 @@ def read_poses(
     pose_units: LengthUnit = "mm",
     invert_poses: bool = False,
 ) -> Float[np.ndarray, "n 4 4"]:
-    """Read a table of poses without a header, one a row.
+    """Read a table of poses without a header.
 
     Args:
-        path: rows of 7 numbers, ``x y z`` and a unit quaternion, or of 12 or 16, the matrix row by
-            row.
+        path: a row for each pose, of 7 numbers, ``x y z`` and a unit quaternion, or of 12 or 16,
+            the matrix row by row; or 3 or 4 rows of 4 numbers, as in :func:`read_crosswire`.
         quaternion: where the scalar stands.
         pose_units: of translations in the file.
         invert_poses: return the inverses of the file's poses.
@@ -294,15 +278,17 @@ def read_poses(
             number, a quaternion whose length is not 1, or what is to be inverted and is no pose;
             the file and the line are named.
     """
-    tabs = first_line(path)[0] == "\t"  # perhaps beside blanks, and at the ends of lines
-    table = read_table(path, header=False, separator="" if tabs else None)
-    rows = _fixed(table, (7, 12, 16), "x y z qx qy qz qw, or a matrix row by row", finite=False)
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    table = _plain_table(path)
+    columns = "x y z qx qy qz qw, a matrix row by row, or 3 rows R t"
+    rows = _fixed(table, (7, 12, 16, 4), columns, finite=False)
+    lines = table.lines
     if rows.shape[1] != 7:
-        matrices = rows.reshape(len(rows), -1, 4)
+        matrices, lines = _stacked(table, rows)
         matrices[:, :3, 3] *= LENGTHS_MM[pose_units]
+        poses = np.tile(np.eye(4), (len(matrices), 1, 1))
         poses[:, : matrices.shape[1]] = matrices
     else:
+        poses = np.tile(np.eye(4), (len(rows), 1, 1))
         with naming(path):
             try:
                 poses[:, :3, :3] = rotations_from_quaternions(
@@ -316,9 +302,44 @@ def read_poses(
     # The inverse of what is no pose may look like one.
     with naming(path):
         try:
-            return inverse_poses(check_poses(poses, labels=_labels(table.lines)))
+            return inverse_poses(check_poses(poses, labels=_labels(lines)))
         except InputError as error:
             raise FormatError(str(error)) from None
+
+
+def _plain_table(path: str | os.PathLike[str]) -> Table:
+    """A table without a header; blanks or tabs may separate numbers with decimal commas."""
+    _, first = next(text_lines(path), (0, ""))
+    cells = parse_numbers(first.split(), decimal_comma=True)
+    white_space = len(cells) > 1 and None not in cells
+    return read_table(path, header=False, separator="" if white_space else None)
+
+
+def _stacked(
+    table: Table, rows: Float[np.ndarray, "rows columns"]
+) -> tuple[Float[np.ndarray, "n k 4"], list[int]]:
+    """Matrices of 3 or 4 rows from rows of 12, 16 or 4 numbers, and the line of each.
+
+    Raises:
+        FormatError: rows of 4 numbers that are not whole poses.
+    """
+    if rows.shape[1] != 4:
+        return rows.reshape(len(rows), -1, 4), table.lines
+    matrices = rows.reshape(-1, 4, 4) if len(rows) % 4 == 0 else np.empty((0, 4, 4))
+    edge = [0, 0, 0, 1]
+    # Whole matrices: no row of a rotation is zero.
+    if len(matrices) and (matrices[:, 3] == edge).all():
+        return matrices, table.lines[::4]
+    if len(matrices) and (matrices[:, :, 3] == edge).all():
+        raise FormatError(
+            f"{table.row(3)}: the matrices are transposed: 0 0 0 1 is their last column, and "
+            "should be their last row"
+        )
+    if len(rows) % 3:
+        raise FormatError(
+            f"{table.row(-1)}: {len(rows)} rows are not whole poses: each takes 3 rows"
+        )
+    return rows.reshape(-1, 3, 4), table.lines[::3]
 
 
 def _labels(lines: list[int]) -> list[str]:
@@ -348,10 +369,11 @@ def _columns(table: Table, quaternion: QuaternionOrder | None) -> Columns:
         return Columns(matrix=matrix, time=0, point=(width - 2, width - 1))
     if width != 10:
         hint = ", or a first line that names the columns"
-        if width == 2:
-            hint = " (name two columns of points by a first line u,v)"
-        if width == 4:
-            hint = " (rows R t are one of a pair of files: POSES POINTS OUT.h5)"
+        if width in (2, 3):
+            names = "u,v" if width == 2 else "frame,u,v"
+            hint = f" (name {width} columns of points by a first line {names})"
+        if width in (4, 12, 16):
+            hint = " (poses alone are one of a pair without headers: POSES POINTS OUT.h5)"
         raise FormatError(
             f"{table.row(0)}: {width} columns without a header; 15 or 19 (time, 12 or 16 "
             f"pose numbers, u and v) or 10 (time, x, y, z, a quaternion, u and v) are needed{hint}"
