@@ -919,6 +919,18 @@ def test_poses_that_are_stored_from_the_tracker(tmp_path, stored, told):
     assert f"poses from {told}" in notes[0]
 
 
+def test_a_reference_that_was_never_seen_is_told(tmp_path):
+    """PLUS writes a Reference of its configuration whether it is there or not."""
+    stored = {PROBE: POSES, ("Reference", "Tracker"): np.tile(np.eye(4), (6, 1, 1))}
+    never = {("Reference", "Tracker"): np.zeros(6, bool)}
+    write_sequence(tmp_path / "s.igs.mha", stored, np.arange(6.0), valid=never)
+    (tmp_path / "p.csv").write_text(POINTS_OF_SIX)
+    recording, notes, *_ = import_files([tmp_path / "s.igs.mha", tmp_path / "p.csv"])
+    np.testing.assert_allclose(recording.calibration.poses, POSES, atol=1e-10)
+    assert notes[0].startswith("poses from Probe to Tracker (")
+    assert notes[0].endswith("; the tracking of Reference was OK in no frame")
+
+
 def test_stylus_tip_as_target(tmp_path, capsys):
     """Pose = probe to stylus; the target is the tip, which rests in the stylus' frame."""
     references = random_poses(6, 9)

@@ -146,13 +146,18 @@ def test_poses_that_a_tracker_repeats_count_once(tmp_path, capsys):
         jaxcal.calibrate_pivot(np.repeat(poses[:2], 10, axis=0))
 
 
-def test_a_tool_that_is_hardly_turned_is_told():
+def test_a_tool_that_is_hardly_turned_is_told(tmp_path, capsys):
     turns = Rotation.from_rotvec(0.002 * np.random.default_rng(1).normal(size=(POSES, 3)))
     result = jaxcal.calibrate_pivot(swung(turns, noise=0.05))
     worst = np.sqrt(np.linalg.eigvalsh(np.asarray(result.covariance)[:3, :3])[-1])
     assert worst > 1
     assert f"known to {worst:.1f} mm (SD)" in result.warnings[0]
     assert "turn the tool farther" in result.warnings[0]
+    np.savetxt(tmp_path / "poses.txt", swung(turns, noise=0.05).reshape(POSES, 16))
+    assert main(["pivot", str(tmp_path / "poses.txt"), "--json"]) == 5
+    record = json.loads(capsys.readouterr().out)
+    assert record["converged"]
+    assert record["uncertain"]
 
 
 def test_metres_are_refused():

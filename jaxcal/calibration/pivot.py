@@ -136,6 +136,24 @@ class Pivot(OneOrBatch, eqx.Module):
         )
 
     @property
+    def uncertain(self) -> bool:
+        """Whether the tip's SD exceeds 1 mm along some direction (one, concrete).
+
+        Raises:
+            InputError: of a batch.
+        """
+        check_one(self.status_code)
+        return self._largest_sd()[0] > _LARGEST_SD_MM
+
+    def _largest_sd(self) -> tuple[float, np.ndarray]:
+        """The tip's largest SD, mm, and its direction in the tool's frame; 0 if it is unknown."""
+        covariance = np.asarray(self.covariance)[:3, :3]
+        if not np.isfinite(covariance).all():
+            return 0.0, np.zeros(3)
+        variances, directions = np.linalg.eigh(covariance)
+        return max(float(variances[-1]), 0.0) ** 0.5, directions[:, -1]
+
+    @property
     def warnings(self) -> list[str]:
         """What a person should know before using this answer (one calibration, concrete).
 
@@ -154,15 +172,13 @@ class Pivot(OneOrBatch, eqx.Module):
             )
         if self.wrong_frames is not None:
             found.append(self.wrong_frames)
-        covariance = np.asarray(self.covariance)[:3, :3]
-        if np.isfinite(covariance).all():
-            variances, directions = np.linalg.eigh(covariance)
-            if variances[-1] > _LARGEST_SD_MM**2:
-                direction = ", ".join(f"{value:.2f}" for value in directions[:, -1])
-                found.append(
-                    f"the tip is known to {variances[-1] ** 0.5:.1f} mm (SD) along ({direction}) "
-                    "of the tool's frame: turn the tool farther, about further axes"
-                )
+        if self.uncertain:
+            sd, along = self._largest_sd()
+            direction = ", ".join(f"{value:.2f}" for value in along)
+            found.append(
+                f"the tip is known to {sd:.1f} mm (SD) along ({direction}) of the tool's frame: "
+                "turn the tool farther, about further axes"
+            )
         named = outliers(self)
         if named:
             told = listed_outliers(self, AXES)

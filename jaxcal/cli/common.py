@@ -32,7 +32,8 @@ class ExitCode(enum.IntEnum):
 
     Only an acquisition ends with 4: stopped early, by a device or a person, and to be resumed. 5 is
     a calibration that converged and is less accurate than was required (fair, if not told
-    otherwise). An import that had to leave out most frames ends with 3.
+    otherwise), or a tip with an SD beyond 1 mm. An import that had to leave out most frames ends
+    with 3.
     """
 
     CONVERGED = 0

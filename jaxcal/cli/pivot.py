@@ -8,6 +8,7 @@ import click
 
 from jaxcal import InputError
 from jaxcal.cli.common import (
+    ExitCode,
     exit_code,
     import_engine,
     json_option,
@@ -41,7 +42,8 @@ def pivot(poses: str, no_robust: bool, as_json: bool, **options: Any) -> int:
     POSES is a sequence of PLUS or Slicer, an export of NDI ToolBox or Motive, a table (CSV) with a
     header, or a text file of poses, tool -> tracker, mm: for each a row x y z qx qy qz qw or the
     matrix row by row (12 or 16 numbers), or three rows of four numbers. Poses that do not fit the
-    rest are left out and named; they are counted from 0, without those that were not tracked.
+    rest are left out and named; they are counted from 0, without those that were not tracked. The
+    status is 5 if the SD of the tip exceeds 1 mm along some direction.
     """
     import_engine()
     from jaxcal.calibration.pivot import calibrate_pivot
@@ -62,4 +64,4 @@ def pivot(poses: str, no_robust: bool, as_json: bool, **options: Any) -> int:
         print_json(record | {"notes": notes})
     else:
         print_page(*pivot_lines(record), *(f"- {note}" for note in notes))
-    return exit_code([record])
+    return exit_code([record]) or (ExitCode.UNCERTAIN if record["uncertain"] else 0)

@@ -32,6 +32,7 @@ def pivot_record(result: Pivot) -> dict[str, Any]:
             "outlier_reasons": outlier_reasons(result, AXES),
             "repeated": int(((mask <= 0) & (np.asarray(result.outlier) <= 0)).sum()),
             "wrong_frames": result.wrong_frames,
+            "uncertain": result.uncertain,
             "warnings": result.warnings,
         }
     )

@@ -224,13 +224,17 @@ def _chosen_frames(sequence: TrackedSequence, options: ImportOptions) -> tuple[s
     if options.target is not None:
         end = options.target if options.target in names else capitalised(options.target)
         return start, end, []
-    tracked = [pair for pair in pairs if set(pair) == set(resting) and sequence.valid[pair].any()]
+    of_reference = [pair for pair in pairs if set(pair) == set(resting)]
+    tracked = [pair for pair in of_reference if sequence.valid[pair].any()]
+    lost = ""
     if tracked and start != "Reference":
         end = "Reference"
     else:
         ends = [target for source, target in pairs if source == start]
         ends += [source for source, target in pairs if target == start and source in resting]
         end = next(iter(ends), "Tracker")
+        if of_reference and not tracked and start != "Reference":
+            lost = "; the tracking of Reference was OK in no frame"
     inverted = (end, start) in pairs and (start, end) not in pairs
     how = f", inverted from {end} to {start}" if inverted else ""
-    return start, end, [f"poses from {start} to {end}{how} (--from and --to choose others)"]
+    return start, end, [f"poses from {start} to {end}{how} (--from and --to choose others){lost}"]
