@@ -226,6 +226,33 @@ def test_a_header_that_numpy_made_a_comment(tmp_path, delimiter):
 
 
 @pytest.mark.parametrize(
+    ("start", "mark", "parts"),
+    [
+        ("pose", ".", ("position", "orientation")),
+        ("field.pose.pose", ".", ("position", "orientation")),
+        ("/tracker/transform", "/", ("translation", "rotation")),
+    ],
+)
+def test_a_header_of_paths_in_ros_messages(tmp_path, start, mark, parts):
+    names = [mark.join((start, parts[0], axis)) for axis in "xyz"]
+    names += [mark.join((start, parts[1], axis)) for axis in "wxyz"]
+    rows = np.array([[k, 3 * k, 1, 1, 0, 0, 0, 9 - k, k, 1e9 * k] for k in range(1, 7)])
+    path = tmp_path / "table.csv"
+    header = ",".join([*names, "u", "v", "%time"])
+    np.savetxt(path, rows, delimiter=",", header=header, comments="")
+    images = recording_of(read_pose_table(path, pose_units="m")).calibration
+    np.testing.assert_allclose(images.poses[:, :3, 3], 1000 * rows[:, :3])
+    np.testing.assert_allclose(images.time, range(1, 7))
+    np.testing.assert_allclose(images.poses[:, :3, :3], np.tile(np.eye(3), (6, 1, 1)))
+
+
+def test_a_header_of_points_that_are_named_as_positions(tmp_path):
+    (tmp_path / "table.csv").write_text("frame,x,y\n0,1,2\n")
+    with pytest.raises(FormatError, match=r"x, y but not all of x, y and z \(points in the image"):
+        read_pose_table(tmp_path / "table.csv")
+
+
+@pytest.mark.parametrize(
     ("change", "message"),
     [
         (

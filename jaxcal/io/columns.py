@@ -1,7 +1,8 @@
 """The meaning of a table's columns, by the names in its header.
 
 Names are compared without case, blanks and underscores. A unit may stand in brackets or behind an
-underscore: ``tx [mm]``, ``time (ms)``, ``u_px``.
+underscore: ``tx [mm]``, ``time (ms)``, ``u_px``. Of a path in a ROS message (``pose.position.x``,
+``/pose/orientation/w``) the last two names count.
 """
 
 from __future__ import annotations
@@ -38,6 +39,8 @@ _ROLE = {name: role for role, names in _NAMES.items() for name in names}
 _UNIT = re.compile(
     r"^(.*?)(?:\s*[\[(]\s*([^\])]*?)\s*[\])]|[_\s](mm|cm|m|in|px|pixels?|s|ms|us|ns))?$"
 )
+_OF_MESSAGE = re.compile(r".*[./]((?:position|translation|orientation|rotation)[./][xyzw])")
+"""A part of a ROS message by its path, as ``pose.position.x``, without what stands before it."""
 _CELL = re.compile(r"([a-z]*?)_?([0-4])[_,]?([0-4])")
 _NUMBERED = re.compile(r"([a-z]*?)_?(\d{1,2})")
 _OTHER_ROTATION = re.compile(
@@ -183,13 +186,17 @@ def _unknown(names: list[str], column: int) -> FormatError:
 def _split(name: str) -> tuple[str, str | None]:
     found = _UNIT.match(name.strip().lower())
     assert found is not None
-    return re.sub(r"[\s_.]+", "", found[1]), found[2] or found[3]
+    base = _OF_MESSAGE.sub(r"\1", found[1])
+    return re.sub(r"[\s_./]+", "", base), found[2] or found[3]
 
 
 def _base_and_unit(name: str) -> tuple[str, str | None]:
     base, unit = _split(name)
     if base == "seconds" and unit is None:
         unit = "s"
+    if base == "%time" and unit is None:
+        # As "rostopic echo -p" writes it.
+        base, unit = "time", "ns"
     if unit is not None and unit not in _UNITS:
         raise FormatError(f"the unit of {quoted(name)} is not known")
     return base, None if unit is None else _UNITS[unit]
@@ -200,7 +207,8 @@ def _complete(roles: dict[str, int], names: tuple[str, ...], what: str) -> tuple
     if not present:
         return None
     if len(present) < len(names):
-        raise FormatError(f"the header has {', '.join(present)} but not all of {what}")
+        hint = " (points in the image are named u and v)" if present == ["x", "y"] else ""
+        raise FormatError(f"the header has {', '.join(present)} but not all of {what}{hint}")
     return tuple(roles[name] for name in names)
 
 
