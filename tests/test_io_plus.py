@@ -292,6 +292,12 @@ def test_pixel_sizes_that_fcal_itself_wrote_are_not_stale():
             [OTHER.replace("StylusTip", "Image").replace('"Stylus"', '"Reference"')],
             "line 7: Image to Reference is a second path from Image as soon as",
         ),
+        (
+            "",
+            [OTHER.replace("StylusTip", "Image").replace('"Stylus"', '"UsProbe"')],
+            "line 7: Image to UsProbe is a second path from Image as soon as the tracker sends "
+            "Probe and UsProbe: take it out then",
+        ),
     ],
 )
 def test_what_plus_hears_of_the_image_while_it_runs_is_told(sent, inside, message):

@@ -373,11 +373,17 @@ def _other_sources(root: Element, others: list[Element], wanted: FramePair) -> l
             "take ImageToTransducerTransformName out, or give it another name"
         )
     for element in others:
-        if _frames(element) in ((wanted[0], "Reference"), (wanted[0], "Tracker")):
-            notes.append(
-                f"line {element.line}: {wanted[0]} to {_frames(element)[1]} is a second path from "
-                f"{wanted[0]} as soon as the tracker sends {wanted[1]}: take it out then"
-            )
+        source, target = _frames(element)
+        if source != wanted[0] or target.startswith("Transducer"):
+            continue
+        # Any other frame is tracked as the new one is: the probe under its old name, or another.
+        when = f"the tracker sends {wanted[1]}"
+        if target not in ("Reference", "Tracker"):
+            when += f" and {target}"
+        notes.append(
+            f"line {element.line}: {source} to {target} is a second path from {source} as soon as "
+            f"{when}: take it out then"
+        )
     return notes
 
 
