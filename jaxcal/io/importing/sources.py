@@ -96,7 +96,9 @@ _NOT_IMPORTED = {
     ".png": " (name the folder of the PNG images)",
     ".dcm": " (--spacing-from reads its pixel size)",
     ".vtk": "",
-    **dict.fromkeys((".avi", ".mp4", ".mov", ".mkv"), " (save its frames as PNG in a folder)"),
+    **dict.fromkeys((".avi", ".mp4", ".mov"), " (save its frames as PNG in a folder)"),
+    ".mkv": " (PLUS's EditSequenceFile converts what PLUS or Slicer recorded to .igs.mha; of "
+    "another video save the frames as PNG in a folder)",
     **dict.fromkeys(
         (".bag", ".mcap", ".db3"),
         " (save its poses as a table, CSV, and its images as PNG in a folder)",
