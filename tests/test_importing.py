@@ -385,6 +385,19 @@ def test_two_tables_of_images_by_name(tmp_path):
     assert not imported.most_lost
 
 
+def test_a_table_with_both_is_no_one_of_two_tables(tmp_path):
+    """It ended in an error of numpy."""
+    poses = [np.arange(6), *np.column_stack(POSE_COLUMNS).T]
+    whole = _named(["frame", *POSE_NAMES, "u", "v"], [*poses, *PIXELS.T])
+    (tmp_path / "both.csv").write_text(whole)
+    (tmp_path / "p.csv").write_text(_named(["frame", "u", "v"], [np.arange(6), *PIXELS.T]))
+    (tmp_path / "poses.csv").write_text(_named(["frame", *POSE_NAMES], poses))
+    for other in ("p.csv", "poses.csv", "both.csv"):
+        for pair in (("both.csv", other), (other, "both.csv")):
+            with pytest.raises(InputError, match="a table with both is imported by itself"):
+                import_files([tmp_path / name for name in pair])
+
+
 @pytest.mark.parametrize(
     ("names", "numbers", "message"),
     [

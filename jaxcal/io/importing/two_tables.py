@@ -46,7 +46,8 @@ def one_of_two_tables(
             two poses of one image, or a lag of rows that are not matched by time.
     """
     poses, points = (first, second) if first.poses is not None else (second, first)
-    if poses.poses is None or points.points is None or (poses.points, points.poses) != (None, None):
+    missing = poses.poses is None or points.points is None
+    if missing or poses.points is not None or points.poses is not None:
         raise InputError(
             f"{first.name} and {second.name}: one table must hold the poses, the other one the "
             "points (u and v, or lateral and range); a table with both is imported by itself"
