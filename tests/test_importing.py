@@ -954,6 +954,9 @@ def test_stylus_tip_as_target(tmp_path, capsys):
     sources = [str(tmp_path / "s.igs.mha"), str(tmp_path / "p.csv"), str(tmp_path / "r.h5")]
     assert main(["import", *sources, "--to", "Stylus"]) == 0
     np.testing.assert_allclose(jaxcal.load(sources[2]).calibration.poses, POSES, atol=1e-11)
+    capsys.readouterr()
+    assert main(["import", *sources]) == 0
+    assert "choose others; --to Stylus if its tip is the target)" in capsys.readouterr().out
     assert main(["import", *sources, "--from", "Needle"]) == 2
     assert "no transforms lead from 'Needle'" in capsys.readouterr().err
 

@@ -237,4 +237,13 @@ def _chosen_frames(sequence: TrackedSequence, options: ImportOptions) -> tuple[s
             lost = "; the tracking of Reference was OK in no frame"
     inverted = (end, start) in pairs and (start, end) not in pairs
     how = f", inverted from {end} to {start}" if inverted else ""
-    return start, end, [f"poses from {start} to {end}{how} (--from and --to choose others){lost}"]
+    tip = ""
+    for pair in pairs:
+        of_stylus = "Stylus" in pair and start != "Stylus" and not set(resting).isdisjoint(pair)
+        if of_stylus and 2 * sequence.valid[pair].sum() > len(sequence):
+            tip = "; --to Stylus if its tip is the target"
+    return (
+        start,
+        end,
+        [f"poses from {start} to {end}{how} (--from and --to choose others{tip}){lost}"],
+    )
