@@ -805,6 +805,9 @@ def test_points_beside_pixels_of_another_orientation(tmp_path, orientation, told
     notes = [note for note in import_files([path, tmp_path / "p.csv"])[1] if "mirrored" in note]
     assert len(notes) == (told is not None)
     assert all(f"is stored as {orientation}" in note and told in note for note in notes)
+    (tmp_path / "p.csv").write_text(f"# jaxcal pick of s.igs.mha\n{POINTS_OF_SIX}")
+    notes = import_files([path, tmp_path / "p.csv"])[1]
+    assert not [note for note in notes if "mirrored" in note]
 
 
 @pytest.mark.parametrize(

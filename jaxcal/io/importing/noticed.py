@@ -7,6 +7,8 @@ import os
 import numpy as np
 
 from jaxcal.io.importing.target_search import FrameResults
+from jaxcal.io.lines import text_lines
+from jaxcal.io.picker.picks import HEAD
 from jaxcal.io.sequence import Pixels, TrackedSequence
 from jaxcal.runtime.array_types import Float
 
@@ -18,10 +20,16 @@ _SAME_SIZE = 0.01
 
 
 def mirrored(sequence: TrackedSequence, points: str | os.PathLike[str]) -> list[str]:
-    """A note where points of the pixels as they are stored would be mirrored."""
+    """A note where points of the pixels as they are stored would be mirrored.
+
+    ``jaxcal pick`` shows frames in MF: its own points need no note.
+    """
     pixels = sequence.pixels
     stored = pixels.orientation if isinstance(pixels, Pixels) else None
     if pixels is None or stored is None or stored == "MF":
+        return []
+    _, first = next(text_lines(points, comments=True), (0, ""))
+    if first.startswith(HEAD):
         return []
     mirrored = {"U": f"u = {pixels.columns - 1} - u", "N": f"v = {pixels.rows - 1} - v"}
     told = " and ".join(text for letter, text in mirrored.items() if letter in stored)

@@ -28,7 +28,8 @@ from jaxcal.io.given_files import read_bytes
 from jaxcal.io.text import read_pose_table
 from jaxcal.runtime.messages import quoted
 
-_HEAD = "# jaxcal pick of "
+HEAD = "# jaxcal pick of "
+"""How the first line of such a file begins."""
 _SKIPPED = "# skipped:"
 _MOST_BYTES = 2**24
 _UNTOLD = r'^[\s"]|[\\\r\n\ud800-\udfff]'
@@ -79,7 +80,7 @@ class Picks:
         # As the file will have it, also where the name is not UTF-8 or has several lines.
         named = " ".join(name.encode("utf-8", errors="backslashreplace").decode().splitlines())
         stated = f", orientation {orientation}" if orientation else ""
-        self._head = f"{_HEAD}{named}: {size[0]} x {size[1]} px, {count} frames{stated}"
+        self._head = f"{HEAD}{named}: {size[0]} x {size[1]} px, {count} frames{stated}"
         self.points: dict[int, Point] = {}
         self.skipped: set[int] = set()
         self._before: list[tuple[int, Point | None, bool]] = []
@@ -174,12 +175,12 @@ class Picks:
     def _load(self, content: str, count: int) -> None:
         # Not splitlines: an image's name may hold what that takes for the end of a line.
         lines = re.split(r"\r?\n", content.rstrip("\r\n"))
-        if not lines[0].startswith(_HEAD):
+        if not lines[0].startswith(HEAD):
             raise FormatError(f"{self.path}: exists and was not made by jaxcal pick: name another")
         if lines[0] != self._head:
             raise FormatError(
-                f"{self.path}: has points of {lines[0].removeprefix(_HEAD)!r}, not of "
-                f"{self._head.removeprefix(_HEAD)!r}: name another file"
+                f"{self.path}: has points of {lines[0].removeprefix(HEAD)!r}, not of "
+                f"{self._head.removeprefix(HEAD)!r}: name another file"
             )
         told = lines[1].removeprefix(_SKIPPED) if len(lines) > 1 else ""
         one = r'"(?:[^"]|"")*"' if self.files else r"\d{1,9}"
