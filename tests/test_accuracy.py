@@ -44,6 +44,7 @@ from jaxcal.report.contradictions import _explanation
 from jaxcal.report.in_memory import record_of, recording_of
 from jaxcal.report.next_poses import next_poses_sentences, pose_records
 from jaxcal.report.record import _precision, calibration_record
+from jaxcal.report.resampled import resampled_sentences
 from jaxcal.report.tables import calibration_table
 from jaxcal.report.verdict import certainty, headline, limits, verdict
 from jaxcal.result.calibration import Status
@@ -554,7 +555,7 @@ def contradicted(kind, record):
         moved = [*quiet[:-1], 3.7]
         changed["cross_validation"] = {
             "folds": count, "folds_converged": count, "image_moved_mm": moved, "stated_mm": 0.4,
-            "precision_mm": 1.3, "most_influential": [], "influence": quiet,
+            "precision_mm": 1.3,
         }  # fmt: skip
     else:
         changed["bootstrap"] = {
@@ -714,6 +715,45 @@ def test_resampling_that_agrees_changes_nothing(record, left_out):
     changed["bootstrap"] = {"rms_scatter_mm": [0.42] * 5, "stated_mm": 0.4}
     settle(changed)
     assert (changed["verdict"], changed["tre"]["factor"]) == ("good", 1.0)
+
+
+@pytest.mark.parametrize("used", [8, 12, 20, 24])
+def test_resamples_of_few_images_contradict_nothing(record, used):
+    """The variance of a scatter from 20 images has a relative SD of a third."""
+    changed = stating(record, 0.4) | {"images_used": used, "prior": "auto"}
+    each = 1.7 * 0.4 / np.sqrt(used - 1)
+    moved = [each] * used + [None] * (changed["images"] - used)
+    changed["cross_validation"] = {
+        "folds": used, "folds_converged": used, "image_moved_mm": moved, "stated_mm": 0.4,
+    }  # fmt: skip
+    settle(changed)
+    # Without one of 8 images the SDs are not tuned: these calibrations are other estimates.
+    told = " ".join(changed["tre"]["contradictions"])
+    assert ("cross-validation scatter by" in told) == (used > 8)
+    changed["cross_validation"]["image_moved_mm"] = [by and 1.35 / 1.7 * by for by in moved]
+    changed["bootstrap"] = {"rms_scatter_mm": [1.7 * 0.4] * 5, "stated_mm": 0.4}
+    settle(changed)
+    told = " ".join(changed["tre"]["contradictions"])
+    assert "cross-validation" not in told
+    assert ("bootstrap scatter by" in told) == (used >= 20)
+
+
+def test_an_image_is_not_blamed_for_sds_that_are_no_longer_tuned(record):
+    changed = stating(record, 0.4) | {"images_used": 8, "prior": "auto"}
+    rest = [None] * (changed["images"] - 8)
+    changed["cross_validation"] = {
+        "folds": 8, "folds_converged": 8, "image_moved_mm": [3.7] * 8 + rest, "stated_mm": 0.4,
+    }  # fmt: skip
+    settle(changed)
+    assert "alone changes" not in " ".join(changed["tre"]["contradictions"])
+    settle(changed := changed | {"prior": "none"})
+    assert "image 7 alone changes" in " ".join(changed["tre"]["contradictions"])
+
+
+def test_bootstrap_of_few_images_is_said_to_scatter_more(record):
+    changed = contradicted("bootstrap", record)
+    assert len(resampled_sentences(changed)) == 1
+    assert "Of 12 images a resample" in resampled_sentences(changed | {"images_used": 12})[1]
 
 
 def test_position_and_orientation_have_the_error_of_all_axes(record):

@@ -8,7 +8,9 @@ The covariance assumes that the noise model holds. It is contradicted if
 - leaving one image out moves image points by more than half the stated error and by more than four
   times the expected move (by one step from the normal equations, or by cross-validation if this was
   requested);
-- the scatter in cross-validation or bootstrap is more than 1.3 times the stated error;
+- the scatter in cross-validation or bootstrap is more than 1.3 times the stated error, and by more
+  than the chance of a scatter that is known from so many images (with few images, calibrations of
+  fewer are other estimates, and are not compared);
 - test images scatter far more than the calibration explains, also without a few of them that do not
   fit the others;
 - the errors within the image drift, come in two groups, or would be explained by an error that the
@@ -30,8 +32,11 @@ from collections.abc import Sequence
 from typing import Any
 
 from jaxcal.diagnostics.misfits import DRIFT_SCORE, in_two_groups
+from jaxcal.diagnostics.residual_checks import FEWEST_TO_CHECK
 from jaxcal.diagnostics.unmodelled import SIDE_MM
 from jaxcal.diagnostics.warnings import IMPLAUSIBLE_RMS_MM
+from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
+from jaxcal.solvers.plan import TUNED
 
 CHANCE = 3.0
 """SDs of chance beyond which the residuals contradict the stated error."""
@@ -47,7 +52,8 @@ LIMITS_TIMES = 1.25
 """Bounded or uniform offsets contradict the stated error if the answer is farther from the fit with
 Gaussian offsets than so many times the error of that fit."""
 SCATTER_TIMES = 1.3
-"""Resampled calibrations may scatter by up to so many times the stated error."""
+"""Resampled calibrations may scatter by up to so many times the stated error; with fewer than about
+40 images by more (:func:`_largest_scatter`)."""
 
 SLOW = 0.5
 """Least slowness of a slow path (:func:`jaxcal.calibration.serial_correlation.slowness`)."""
@@ -141,7 +147,7 @@ def _from_residuals(record: dict[str, Any]) -> list[tuple[float, str]]:
 def _from_images(record: dict[str, Any]) -> list[tuple[float, str]]:
     """The image that moves the answer most, if too much; by cross-validation if there is one."""
     stated, influence = record["tre"]["stated_mm"], record["influence"]
-    held = record.get("cross_validation")
+    held = _comparable_folds(record)
     moved, how = influence["moved_mm"], "to first order"
     if held is not None and held["folds"] == len(_each_used(held)):
         moved, how = held["image_moved_mm"], "by a calibration without it"
@@ -438,23 +444,48 @@ def _each_used(held: dict[str, Any]) -> list[float]:
     return [by for by in held["image_moved_mm"] if by is not None]
 
 
+def _comparable_folds(record: dict[str, Any]) -> dict[str, Any] | None:
+    """The cross-validation, if there is one and its calibrations are like that of all images.
+
+    If leaving out a fold leaves too few images to tune the SDs, its calibration has other SDs, and
+    moves for this reason.
+    """
+    held, used = record.get("cross_validation"), record["images_used"]
+    if held is None:
+        return None
+    left = used - math.ceil(used / held["folds"])
+    other = record["prior"] in TUNED and left < MINIMUM_SELF_TUNING <= used
+    return None if other else held
+
+
+def _largest_scatter(stated: float, count: int) -> float:
+    """The largest scatter of resampled calibrations that does not contradict the stated error, mm.
+
+    The variance of a scatter that comes from so many images has a relative SD of about
+    sqrt(2 / (count - 1)).
+    """
+    by_chance = math.sqrt(1 + CHANCE * math.sqrt(2 / (count - 1)))
+    return max(SCATTER_TIMES, by_chance) * stated
+
+
 def _from_resampling(record: dict[str, Any]) -> list[tuple[float, str]]:
     found: list[tuple[float, str]] = []
-    held, drawn = record.get("cross_validation"), record.get("bootstrap")
+    held, drawn = _comparable_folds(record), record.get("bootstrap")
     if held is not None and held["folds"] == held["folds_converged"]:
         # The jackknife. All images of a fold are held out together; the first ones in use are of a
         # fold each.
         folds, stated = held["folds"], held["stated_mm"]
         moved = _each_used(held)[:folds]
         scatter = math.sqrt((folds - 1) / folds * sum(by**2 for by in moved))
-        if stated and scatter > SCATTER_TIMES * stated:
+        if stated and scatter > _largest_scatter(stated, folds):
             words = f"the calibrations of the cross-validation {_scatter(scatter, stated)}"
             found.append((scatter / stated, words))
-    if drawn is not None and drawn["stated_mm"]:
+    # A resample of n images has about 0.63 n different ones.
+    if drawn is not None and drawn["stated_mm"] and record["images_used"] >= FEWEST_TO_CHECK:
         known = [value for value in drawn["rms_scatter_mm"] if value is not None]
         scatter = math.sqrt(sum(value**2 for value in known) / max(len(known), 1))
         stated = drawn["stated_mm"]
-        if scatter > SCATTER_TIMES * stated:
+        if scatter > _largest_scatter(stated, record["images_used"]):
             words = f"the calibrations of the bootstrap {_scatter(scatter, stated)}"
             found.append((scatter / stated, words))
     return found

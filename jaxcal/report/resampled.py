@@ -7,15 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jaxcal.diagnostics.residual_checks import FEWEST_TO_CHECK
 from jaxcal.report.accuracy import stated_at
 from jaxcal.report.record import plain
 from jaxcal.result.calibration import Calibration
 
 if TYPE_CHECKING:
     from jaxcal.calibration.resampling import Bootstrap, CrossValidation
-
-INFLUENTIAL = 1.0
-"""An image is named if leaving it out moves X by more than this many of X's SDs."""
 
 
 def cross_validation_record(found: CrossValidation, result: Calibration) -> dict[str, Any]:
@@ -65,17 +63,6 @@ def resampled_sentences(record: dict[str, Any]) -> list[str]:
             f"On images that were not used for the calibration, the reconstruction precision is "
             f"{held['precision_mm']:.2f} mm ({held['folds']}-fold cross-validation)."
         )
-        strong = [
-            image
-            for image in held["most_influential"]
-            if (held["influence"][image] or 0.0) > INFLUENTIAL
-        ]
-        if strong:
-            first = strong[0]
-            lines.append(
-                f"Image {first} alone changes the calibration by {held['influence'][first]:.1f} of "
-                "its standard deviations: check this image."
-            )
     drawn = record.get("bootstrap")
     if drawn is not None and drawn["reproducibility_mm"][-1] is not None:
         worst = max(value for value in drawn["reproducibility_mm"] if value is not None)
@@ -92,4 +79,9 @@ def resampled_sentences(record: dict[str, Any]) -> list[str]:
             f"scatters by {drawn['reproducibility_mm'][-1]:.2f} mm, the worst corner by "
             f"{worst:.2f} mm, and the orientation by {turned:.2f} degrees."
         )
+        if record["images_used"] < FEWEST_TO_CHECK:
+            lines.append(
+                f"Of {record['images_used']} images a resample has so few different ones that this "
+                "scatter is usually larger than the error of the calibration from all of them."
+            )
     return lines
