@@ -54,11 +54,30 @@ def test_words_never_name_a_law_that_the_offsets_contradict():
     assert said.startswith("The estimate assumes offsets that are Gaussian (100 %), but")
     none = _law_in_words({"gaussian": 1.0, "uniform": 0.0}, list(FAMILIES))
     assert none.startswith("None of the distributions compared fits the offsets")
-    fine = _law_in_words({"gaussian": 0.2, "uniform": 0.8}, ["student"])
-    assert fine == (
-        "Of the distributions of the offsets that were compared, the data prefer: uniform with "
-        "sharp limits (80 %) or Gaussian (20 %)"
+    told = {"uniform": 0.8, "bell": 0.03, "gaussian": 0.165, "student": 0.005}
+    assert _law_in_words(told, ["student"]) == (
+        "Of the distributions of the offsets that were compared, the most probable: uniform with "
+        "sharp limits (80 %), then Gaussian (16 %)"
     )
+
+
+def test_what_was_believed_before_is_not_said_to_come_from_the_images():
+    """Of 12 images: the uniform one had 40 % before them, and has less after."""
+    after = {"uniform": 0.36, "bell": 0.22, "gaussian": 0.22, "student": 0.2}
+    assert _law_in_words(after, []) == (
+        "These images hardly tell the distributions of the offsets apart: uniform with sharp "
+        "limits (36 %), then bell-shaped with sharp limits (22 %), then Gaussian (22 %), then "
+        "heavy-tailed (20 %)"
+    )
+    # Nothing else was compared.
+    assert _law_in_words({"uniform": 1.0}, []) == (
+        "The offsets are taken to be uniform with sharp limits, as asked for"
+    )
+    assert "look Gaussian" in _law_in_words({"uniform": 1.0}, ["uniform", "bell", "student"])
+    recording = jaxcal.simulate_recording(jaxcal.Protocol(images=12), 0)
+    law = offset_law(jaxcal.calibrate(recording, prior="uniform").numpy())
+    assert law is not None
+    assert str(law["words"]).startswith("The offsets are taken to be uniform")
 
 
 @pytest.mark.slow
@@ -70,4 +89,4 @@ def test_five_thousand_uniform_offsets_are_not_called_gaussian():
     words = str(law["words"])
     assert "uniform with sharp limits" in words
     assert "gaussian" in law["contradicted"]
-    assert "the data prefer: G" not in words
+    assert "most probable: G" not in words

@@ -17,7 +17,7 @@ import numpy as np
 from scipy import special
 
 from jaxcal.diagnostics.residual_checks import FEWEST_TO_CHECK
-from jaxcal.model.distributions import FAMILIES
+from jaxcal.model.distributions import FAMILIES, SHAPES
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Float
 
@@ -26,6 +26,9 @@ CONTRADICTED: dict[str, float] = {"uniform": 1.25, "bell": 1.25, "gaussian": 1.2
 
 MEDIAN_OF_STUDENT = 0.5237
 """Median magnitude of Student's t4, divided by its SD."""
+
+BAYES_FACTOR = 10.0
+"""The data tell two distributions apart if they are so many times as probable under one of them."""
 
 _FAMILY = {
     "uniform": "uniform with sharp limits",
@@ -81,7 +84,8 @@ def offset_law(result: Calibration) -> dict[str, object] | None:
     wrong = None
     if weighed:
         wrong = _contradicted(result)
-        words = _law_in_words(probability, wrong)
+        considered = ("uniform",) if result.prior == "uniform" else FAMILIES
+        words = _law_in_words({name: probability[name] for name in considered}, wrong)
         if mean_probability > 0.5:
             words += f", about a mean of {float(law.mean):.2f} +- {float(law.mean_sd):.2f} mm"
         noise = "each image's own covariance" if own > 0.5 else "the same SDs in all images"
@@ -110,13 +114,29 @@ def _contradicted(result: Calibration) -> list[str]:
 def _law_in_words(probability: dict[str, float], wrong: list[str]) -> str:
     ranked = sorted(probability.items(), key=lambda item: -item[1])
     named = [(name, p) for name, p in ranked if p >= 0.1]
-    told = " or ".join(f"{_FAMILY[name]} ({100 * p:.0f} %)" for name, p in named)
-    if not wrong or any(name not in wrong for name, _ in named):
-        return f"Of the distributions of the offsets that were compared, the data prefer: {told}"
-    fitting = [words for name, words in _FAMILY.items() if name not in wrong]
-    if not fitting:
-        return f"None of the distributions compared fits the offsets; the least bad is {told}"
-    return (
-        f"The estimate assumes offsets that are {told}, but the estimated offsets look "
-        f"{' or '.join(fitting)}"
-    )
+    told = ", then ".join(f"{_FAMILY[name]} ({100 * p:.0f} %)" for name, p in named)
+    compared = len(probability) > 1
+    if wrong and all(name in wrong for name, _ in named):
+        fitting = [words for name, words in _FAMILY.items() if name not in wrong]
+        if fitting:
+            return (
+                f"The estimate assumes offsets that are {told}, but the estimated offsets look "
+                f"{' or '.join(fitting)}"
+            )
+        if compared:
+            return f"None of the distributions compared fits the offsets; the least bad is {told}"
+    if not compared:
+        return f"The offsets are taken to be {_FAMILY[ranked[0][0]]}, as asked for"
+    if _told_apart(probability):
+        return f"Of the distributions of the offsets that were compared, the most probable: {told}"
+    return f"These images hardly tell the distributions of the offsets apart: {told}"
+
+
+def _told_apart(probability: dict[str, float]) -> bool:
+    """Whether the data make some distribution clearly more probable than it was, and another less.
+
+    The probabilities alone do not say this: the uniform distribution has 40 % before any image.
+    """
+    before = {name: sum(each.prior for each in SHAPES if each.family == name) for name in FAMILIES}
+    factors = [p / before[name] for name, p in probability.items()]
+    return max(factors) > BAYES_FACTOR * min(factors)
