@@ -791,7 +791,7 @@ def test_why_larger_residuals_are_believed(record):
         "rms_mm": 1.01, "conventional_rms_mm": 0.98, "conventional_tre_mm": 0.44, "tre_mm": 0.41,
         "log_density_gain": 20.6, "log_density_gain_sd": 5.5, "apart_mm": 0.43,
     }  # fmt: skip
-    said = " ".join(verdict({**record, "comparison": beside}))
+    said = " ".join(verdict({**record, "prior": "auto", "comparison": beside}))
     assert "larger than that of the conventional fit (1.010 against 0.980 mm)" in said
     assert "an expected error of 0.44 mm, one with weights from these sizes 0.41 mm" in said
     assert "predicts held-out images better than the conventional fit (log density +20.6" in said
@@ -800,6 +800,37 @@ def test_why_larger_residuals_are_believed(record):
     said = " ".join(verdict({**record, "comparison": beside | {"tre_mm": None}}))
     assert "minimises exactly this. This calibration predicts held-out images" in said
     assert "+- 5.5). In the image, the two calibrations differ by 0.43 mm." in said
+    # A gain that may be chance is none.
+    for gain, than in (
+        (10.9, "about as well as"),
+        (-10.9, "about as well as"),
+        (-12, "worse than"),
+    ):
+        said = " ".join(verdict({**record, "comparison": beside | {"log_density_gain": gain}}))
+        assert f"predicts held-out images {than} the conventional fit" in said
+
+
+def test_a_bound_is_not_said_to_weigh_by_the_sizes_of_errors(record):
+    """Whose fit would be at least as good as one with equal weights."""
+    beside = {
+        "rms_mm": 1.01, "conventional_rms_mm": 0.98, "conventional_tre_mm": 0.53, "tre_mm": 1.26,
+        "log_density_gain": None, "log_density_gain_sd": None, "apart_mm": 0.07,
+    }  # fmt: skip
+    said = " ".join(verdict({**record, "prior": "bounded", "comparison": beside}))
+    assert "with weights from" not in said
+    assert "anything within the bound, this one has 1.26 mm." in said
+
+
+def test_the_conventional_fit_predicts_images_with_the_variances_that_it_states():
+    recording = experiment(3, images=24, elevation_mm=1.0)
+    answer = jaxcal.calibrate(recording)
+    beside = record_of(answer)["comparison"]
+    alone = jaxcal.calibrate(recording, "conventional")
+    gain = influence_of(answer).log_density.sum() - influence_of(alone).log_density.sum()
+    assert beside["log_density_gain"] == pytest.approx(gain, rel=1e-6)
+    # Errors that are only rounding have no density.
+    exact = jaxcal.calibrate(experiment(3, images=12, elevation_mm=0.0, noise_mm=0.0))
+    assert record_of(exact)["comparison"]["log_density_gain"] is None
 
 
 def test_exit_status_says_less_than_required(tmp_path, capfd):

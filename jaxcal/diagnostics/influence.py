@@ -32,7 +32,6 @@ References: Cook 1977 (leaving out); MacKinnon and White 1985 (the residuals' co
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -97,15 +96,22 @@ class WhitenedErrors:
     variances: Float[Array, " k"]
 
     def covariances(
-        self, precision: Float[Array, " p"], invert: Callable[[Array], Array] = np.linalg.inv
+        self, precision: Float[Array, " p"]
     ) -> tuple[Float[Array, "p p"], Float[Array, "p p"]]:
-        """S^-1 and the covariance of the unknowns, with the precision of their priors."""
+        """S^-1 and the covariance of the unknowns, with the precision of their priors.
+
+        NaN where the images do not determine all unknowns.
+        """
         by_error, prior = np.einsum("mkp,mkq->kpq", self.rows, self.rows), np.diag(precision)
-        inverse = invert(by_error.sum(axis=0) + prior)
+        inverse = _inverse(by_error.sum(axis=0) + prior)
         if (self.variances == 1).all():
             return inverse, inverse
         middle = np.einsum("k,kpq->pq", self.variances, by_error) + prior
         return inverse, inverse @ middle @ inverse
+
+
+def _inverse(matrix: Float[Array, "p p"]) -> Float[Array, "p p"]:
+    return inverses(matrix[None], np.finfo(float).eps)[0]
 
 
 def influence_of(calibration: Calibration) -> Influence:
@@ -136,10 +142,7 @@ def _influence(
     """Influence of whitened errors and a prior of this precision, from which the answer is away."""
     rows, errors = found.rows, found.errors
     components = rows.shape[1]
-    # NaN where the images do not determine all unknowns.
-    inverse, covariance = found.covariances(
-        precision, lambda matrix: inverses(matrix[None], np.finfo(float).eps)[0]
-    )
+    inverse, covariance = found.covariances(precision)
     if not at_minimum:
         # An answer averaged over laws, or an alternation that stopped early, does not minimise
         # these errors: take them at the minimum.
@@ -204,12 +207,17 @@ def whitened_errors(answer: Calibration) -> WhitenedErrors:
     if answer.prior == "bounded":
         free = used & (answer.at_bound[0] == 0)
         return _equal_weights(seen, np.asarray(answer.elevation), sd, used, free)
-    found = _equal_weights(seen, np.zeros_like(seen.mask), sd, used)
+    lever = float(seen.lever(np.asarray(answer.mask))[0])
+    return _by_axis(_equal_weights(seen, np.zeros_like(seen.mask), sd, used), lever / sd)
+
+
+def _by_axis(found: WhitenedErrors, lever: float) -> WhitenedErrors:
+    """Errors of a fit with equal weights, with a variance of each axis; the lever arm in SDs."""
     parts = np.einsum("mkp,mkq->kpq", found.rows, found.rows)
-    inverse = inverses(parts.sum(axis=0)[None], np.finfo(float).eps)[0]
+    inverse = _inverse(parts.sum(axis=0))
     squares, count = np.sum(found.errors**2, axis=0), np.asarray(float(len(found.rows)))
-    lever = np.asarray(seen.lever(np.asarray(answer.mask))[0] / sd)
-    return replace(found, variances=variances_by_axis(parts, squares, count, inverse, lever))
+    variances = variances_by_axis(parts, squares, count, inverse, np.asarray(lever))
+    return replace(found, variances=variances)
 
 
 def _from_points(answer: Calibration, seen: ImageErrors, used: Array) -> WhitenedErrors:
@@ -286,7 +294,7 @@ def conventional_fit(
 
     Returns:
         The covariance of the fit's unknowns, and the log density of every image's three errors as
-        predicted from the others; 0 where not used.
+        predicted from the others by the fit with a variance of each axis; 0 where not used.
     """
     zero = np.zeros_like(seen.mask)
     plain = _equal_weights(seen, zero, 1.0, used)
@@ -294,11 +302,12 @@ def conventional_fit(
     sd = float(np.sqrt(np.sum(plain.errors**2) / left))
     scaled = _equal_weights(seen, zero, sd, used)
     none = np.zeros(scaled.rows.shape[2])
-    found = _influence(scaled, none, none)
+    inverse, _ = scaled.covariances(none)
     kind = scaled.kind
-    steps, noise = found.residual_rows[used] / sd, noise[used][:, kind[:, None], kind]
+    steps, noise = scaled.rows @ inverse / sd, noise[used][:, kind[:, None], kind]
     covariance = np.einsum("nkp,nkl,nlq->pq", steps, noise, steps)
-    return covariance, found.log_density
+    by_axis = _by_axis(scaled, float(seen.lever(used[None].astype(float))[0]) / sd)
+    return covariance, _influence(by_axis, none, none).log_density
 
 
 def excess(found: Influence, weight: Float[Array, "p p"]) -> tuple[float, float]:

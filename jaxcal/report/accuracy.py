@@ -257,8 +257,9 @@ def _comparison(
     gaussian = float(np.sum(weight * found.model_covariance))
     density = found.log_density - log_density
     gain = spread = None
-    # Within a bound, offsets fit themselves: their errors are zero, and have no density.
-    if answer.prior != "bounded":
+    # Within a bound, offsets fit themselves: their errors are zero, and have no density. SDs at
+    # their lower limit are not those of the errors.
+    if answer.prior != "bounded" and not np.any(answer.sigma_floored):
         gain = float(density.sum())
         spread = float(np.std(density[used], ddof=1) * math.sqrt(used.sum()))
     return {

@@ -52,6 +52,7 @@ from jaxcal.result.saved import transform_from_record
 from jaxcal.result.transform import SaveFormat
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.messages import counted
+from jaxcal.solvers.plan import TUNED
 
 MOST_POSES, MOST_PLANES = 300, 60
 """Most poses, and most image planes, that are drawn in space."""
@@ -537,7 +538,9 @@ def _comparison(record: dict[str, Any]) -> str:
     rows = [
         ("residual, root mean square (mm)", length("conventional_rms_mm"), length("rms_mm")),
         (
-            "expected error, if independent and Gaussian (mm)",
+            "expected error, if errors are independent and Gaussian (mm)"
+            if record["prior"] in TUNED
+            else "expected error: Gaussian offsets; any offsets within the bound (mm)",
             length("conventional_tre_mm"),
             length("tre_mm"),
         ),

@@ -22,6 +22,9 @@ _MOST_MOVED_SHARE = 0.3
 """An image is named if leaving it out moves image points by more than this share of the stated
 error."""
 
+CLEAR_SDS = 2.0
+"""A gain in log density counts from so many of its standard errors on."""
+
 _MOST_FRAMES = 10
 """Largest number of images whose frames are named."""
 
@@ -314,17 +317,23 @@ def believe(record: dict[str, Any]) -> list[str]:
     )
     lines = [first]
     if beside["conventional_tre_mm"] is not None and beside["tre_mm"] is not None:
+        equal, own = _mm(beside["conventional_tre_mm"]), _mm(beside["tre_mm"])
         lines.append(
             "With independent Gaussian errors of the estimated sizes (assumed for this comparison "
-            "only), a fit with equal weights has an expected error of "
-            f"{_mm(beside['conventional_tre_mm'])}, one with weights from these sizes "
-            f"{_mm(beside['tre_mm'])}."
+            f"only), a fit with equal weights has an expected error of {equal}"
+            + (
+                f", one with weights from these sizes {own}."
+                if record["prior"] in TUNED
+                else f". With offsets that may be anything within the bound, this one has {own}."
+            )
         )
     gain, sd = beside["log_density_gain"], beside["log_density_gain_sd"]
     if gain is not None and sd is not None:
-        better = "better" if gain > 0 else "worse"
+        than = "better than" if gain > 0 else "worse than"
+        if abs(gain) <= CLEAR_SDS * sd:
+            than = "about as well as"
         lines.append(
-            f"This calibration predicts held-out images {better} than the conventional fit (log "
+            f"This calibration predicts held-out images {than} the conventional fit (log "
             f"density {gain:+.1f} +- {sd:.1f})."
         )
     lines.append(f"In the image, the two calibrations differ by {_mm(beside['apart_mm'])}.")
