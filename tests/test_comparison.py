@@ -199,6 +199,23 @@ def test_a_verdict_that_expects_larger_errors_is_told(files, capsys):
     assert factors == dict(zip(files, (1.0, 1.0, 2.8), strict=True))
 
 
+def test_lengths_that_may_be_in_another_unit_are_told_wherever_they_are_used(tmp_path, capsys):
+    doubted, other = str(tmp_path / "doubted.json"), str(tmp_path / "other.json")
+    for name in (doubted, other):
+        ImageTransform(place(), SCALE).save(name)
+    record = json.loads(Path(doubted).read_text())
+    Path(doubted).write_text(json.dumps(record | {"doubtful_unit": "may be in cm"}))
+    for arguments, where in (
+        (["compare", doubted, other, *PIXELS], 0),
+        (["apply", doubted, "--pixel", "1", "2"], 1),
+        (["export", doubted, "--plus"], 1),
+    ):
+        assert main(arguments) == 0
+        assert capsys.readouterr()[where].count("may be in cm") == 1
+    assert main(["apply", other, "--pixel", "1", "2"]) == 0
+    assert capsys.readouterr().err == ""
+
+
 def test_without_covariances_nothing_is_claimed(files, tmp_path, capsys):
     plain = str(tmp_path / "plain.tfm")
     ImageTransform(place(), SCALE).save(plain)

@@ -50,7 +50,7 @@ def compare(
     from jaxcal import InputError
     from jaxcal.diagnostics.comparison import compare_calibrations
     from jaxcal.report.differences import what_differs
-    from jaxcal.result.saved import load_calibration, stated_points, stated_source
+    from jaxcal.result.saved import load_calibration, stated_doubt, stated_points, stated_source
     from jaxcal.runtime.messages import quoted
 
     if not 2 <= len(calibrations) <= MOST_FILES:
@@ -78,6 +78,8 @@ def compare(
         for name, factor in factors.items()
         if factor > 1
     ]
+    doubts = [(name, stated_doubt(name)) for name in dict.fromkeys(calibrations)]
+    notes += [f"{name}: {doubt}." for name, doubt in doubts if doubt is not None]
     notes += [
         f"Several calibrations state that they were made from {quoted(name)}. If that is one "
         "recording, they share its errors, and their distance says nothing about their accuracy."

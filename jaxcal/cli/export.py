@@ -108,7 +108,7 @@ def export(
     image plane in metres.
     """
     from jaxcal.io.frame_names import probe_name
-    from jaxcal.result.saved import check_target, load_calibration, renamed
+    from jaxcal.result.saved import check_target, load_calibration, renamed, stated_doubt
 
     asked = sum(chosen is not None for chosen in (format, plus_config, plus_server))
     if asked == 0 and out is not None:
@@ -146,6 +146,8 @@ def export(
         click.echo(transform.text(format, frames=frames), nl=False)
     if named and probe_frame is None and (note := renamed(transform)) is not None:
         click.echo(f"- {note}", err=True)
+    if (doubt := stated_doubt(calibration)) is not None:
+        click.echo(f"- {doubt}", err=True)
     return ExitCode.CONVERGED
 
 

@@ -351,7 +351,20 @@ def stated_source(path: str | os.PathLike[str]) -> str | None:
     Raises:
         FormatError: a ``.json`` that is no JSON object.
     """
-    stated = _stated(path, "source")
+    return _stated_words(path, "source")
+
+
+def stated_doubt(path: str | os.PathLike[str]) -> str | None:
+    """Why a JSON of ours says that its lengths may not be in mm; None if it does not.
+
+    Raises:
+        FormatError: a ``.json`` that is no JSON object.
+    """
+    return _stated_words(path, "doubtful_unit")
+
+
+def _stated_words(path: str | os.PathLike[str], key: str) -> str | None:
+    stated = _stated(path, key)
     return stated if isinstance(stated, str) else None
 
 
