@@ -912,11 +912,25 @@ def test_a_figure_of_a_plan_is_known_as_a_picture_and_may_be_replaced(tmp_path, 
     check_output(path, "a picture", begins_with(*plan._PICTURES))
 
 
+def test_a_plan_tells_that_the_images_there_are_need_attention_first(tmp_path, simulated, capfd):
+    recording = jaxcal.load(simulated)
+    points = recording.calibration.measurements.copy()
+    points[3] += [8.0, 5.0]
+    images = replace(recording.calibration, measurements=points, covariance=None)
+    jaxcal.save(replace(recording, calibration=images), tmp_path / "wrong.h5")
+    said = " ".join(told(capfd, "plan", tmp_path / "wrong.h5", "--images", 1).split())
+    assert "These errors are by the noise model alone. First see to the images" in said
+    found = json.loads(told(capfd, "plan", tmp_path / "wrong.h5", "--images", 1, "--json"))
+    assert found["outliers"] == [3]
+    assert "First see" not in told(capfd, "plan", simulated, "--images", 1)
+
+
 def test_plan_from_nothing_is_words_and_counts(capfd):
     out = told(capfd, "plan", "--images", 6, "--cone", 20, "--seed", 1, "--sigma", 0.1, 0.1, 0.2)
     assert "tilt 20 degrees" in out
     # Fewer are not enough to estimate the SDs, and --until-tre plans no fewer.
     assert "Images needed for an error of 0.5 mm: 8; 0.3 mm: 8;" in out
+    assert "(never fewer than 8, which estimating the errors' SDs takes)" in " ".join(out.split())
     assert out.count("target") >= 6
 
 

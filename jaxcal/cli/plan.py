@@ -181,11 +181,11 @@ def plan(
     prepare_jax()
     if figure is not None:
         check_output(figure, "a picture", begins_with(*_PICTURES), [recording] if recording else ())
-    result = None
+    result, found_wrong = None, {}
     if recording is None:
         candidates = _from_nothing(probe or "linear", depth, lateral, cone, turn, sigma, seed)
     else:
-        result, candidates = _from_recording(
+        result, candidates, found_wrong = _from_recording(
             recording, estimate, probe, depth, lateral, cone, turn, seed
         )
     with progress("planning"):
@@ -196,7 +196,7 @@ def plan(
             found = plan_until(candidates, until_tre, criterion, result)
         if figure is not None:
             save_figure(design.plan_figure(found, until_tre), figure)
-        record = _record(found, recording, candidates.constraints.region, result)
+        record = _record(found, recording, candidates.constraints.region, result) | found_wrong
     if simulate:
         with progress("calibrating simulated recordings"):
             record["simulated"] = [
@@ -287,7 +287,8 @@ def _from_recording(
     cone: float | None,
     turn: float | None,
     seed: int,
-) -> tuple[Any, Candidates]:
+) -> tuple[Calibration, Candidates, dict[str, Any]]:
+    """The calibration, the candidates, and what looks wrong with the recording."""
     from jaxcal import design
     from jaxcal.calibration.calibrate import calibrate
     from jaxcal.data.probe import PRESETS
@@ -295,6 +296,7 @@ def _from_recording(
     from jaxcal.io.hdf5 import load
     from jaxcal.model.unknowns import unknown_names
     from jaxcal.report.next_poses import NOT_PLANNED
+    from jaxcal.report.record import calibration_record
 
     names = unknown_names(estimate)
     if NOT_PLANNED in names:
@@ -313,6 +315,11 @@ def _from_recording(
     if result.status == "failed":
         raise InputError(f"{path}: the calibration failed: there is nothing to plan from")
     refuse_wrong_lengths(result, path)
+    record = calibration_record(result, replace(measured, test=None))
+    wrong = {
+        "contradictions": (record["tre"] or {}).get("contradictions", []),
+        "outliers": record["outliers"],
+    }
     known = measured.probe
     if probe is not None and known not in (None, PRESETS[probe]):
         raise InputError(
@@ -331,7 +338,7 @@ def _from_recording(
         seen = candidates.constraints.region
         middle, edges = _columns(measured.calibration, seen, result.image_transform())
         candidates = around(_region(seen, depth, lateral, middle, edges))
-    return result, candidates
+    return result, candidates, wrong
 
 
 def _record(
@@ -397,6 +404,23 @@ def _print(
     if there and until_tre is not None and found.tre_mm[0] <= until_tre:
         now = f"({found.tre_mm[0]:.2g} mm)"
         reached.append(f"The existing images reach {until_tre:g} mm already {now}.")
+    doubt: list[str] = []
+    if record.get("contradictions") or record.get("outliers"):
+        what = (
+            "what contradicts the noise model"
+            if record["contradictions"]
+            else "images that do not fit the rest"
+        )
+        doubt.append(
+            f"These errors are by the noise model alone. First see to the images that there are: "
+            f"the verdict of jaxcal calibrate names {what}."
+        )
+    few = not there and len(found) < MINIMUM_SELF_TUNING
+    least = (
+        f" (never fewer than {MINIMUM_SELF_TUNING}, which estimating the errors' SDs takes)"
+        if few
+        else ""
+    )
     these = "this image" if len(found) == 1 else f"these {len(found)} images"
     print_page(
         table,
@@ -407,7 +431,8 @@ def _print(
         # A test of real images has their own errors as well.
         f"Predicted with {these}{before}: error over the image {found.tre_mm[-1]:.2g} mm, "
         f"reconstruction precision of images without errors {found.rp_mm[-1]:.2g} mm.",
-        *([f"Images needed{total} for an error of {'; '.join(counts)}."] if counts else []),
+        *([f"Images needed{total} for an error of {'; '.join(counts)}{least}."] if counts else []),
+        *doubt,
         *(_simulated_in_words(errors) for errors in record.get("simulated", ())),
         *([] if figure is None else [f"figure: {figure}"]),
     )
