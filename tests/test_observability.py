@@ -116,6 +116,16 @@ def cost_from(data, matrix, point):
     return minimise(Iterate.of(start, RIGID), InPlane.of(images), images).cost[0]
 
 
+def test_no_pose_is_advised_for_a_delay_of_points():
+    """It is a shift along the axial axis, at any pose."""
+    result = jaxcal.calibrate(problem(1, images=12), "conventional", estimate=("delay",))
+    assert result.status == "unobservable"
+    assert str(result.observability["advice"]).startswith("leave the delay out")
+    said = result.verdict()
+    assert any(line.startswith("- Leave the delay out: of points,") for line in said)
+    assert not any("tilt" in line for line in said)
+
+
 def test_a_narrow_cone_is_weak_but_solved():
     data, truth = in_plane(turned(12, np.radians(3.0)), spread(12), noise=0.02)
     result = jaxcal.calibrate(data, method="conventional")

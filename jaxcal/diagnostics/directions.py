@@ -10,6 +10,8 @@ from jaxcal.result.diagnostics import ADDITIONS
 from jaxcal.runtime.array_types import AnyArray
 from jaxcal.runtime.arrays import finite_or_none
 
+_LEADING = 0.35
+"""An unknown is named if its part of a direction is longer than this share of it."""
 WORTH = 0.7
 """A kind of further image is advised if it tells at least this share of what the best one tells."""
 
@@ -28,7 +30,7 @@ def direction_in_words(vector: AnyArray, blocks: tuple[str, ...]) -> str:
     if not np.isfinite(total) or total == 0:
         return "unknown"
     # X's own blocks are named first: to a reader the target's motion is a consequence of X's.
-    leading = [block for block in blocks if size[block] > 0.35 * total]
+    leading = [block for block in blocks if size[block] > _LEADING * total]
     named = (
         [block for block in leading if block != "point"]
         or leading
@@ -70,7 +72,17 @@ def observability(result: Calibration) -> dict[str, float | str | None]:
 
 
 def poses_to_add(result: Calibration) -> str:
-    """Which further images would tell most about the weakest direction, in words."""
+    """Which further images would tell most about the weakest direction, in words.
+
+    Of points, a delay is a shift of X along the axial axis, whatever the poses.
+    """
+    weakest = np.asarray(result.weakest, float)
+    if result.data == "points" and "delay" in result.blocks:
+        delay = weakest[block_slice(result.blocks, "delay")]
+        if np.linalg.norm(delay) > _LEADING * np.linalg.norm(weakest):
+            return (
+                "leave the delay out: of points, it only shifts the transform along the axial axis"
+            )
     gain = np.nan_to_num(np.asarray(result.inspection.gain, dtype=float))
     if not gain.max() > 0:
         return "add images with the probe tilted about each of its axes"
