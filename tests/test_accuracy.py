@@ -583,6 +583,8 @@ def test_verdict_falls_when_the_covariance_is_contradicted(record, kind):
     # Neither poses nor a number of images are promised to remove what contradicts the model.
     changed["rms_mm"] = 0.45
     said = " ".join(verdict(changed))
+    assert "First see to what contradicts the noise model" in said
+    assert "vary all tilts" not in said
     assert "add other poses" not in said
     assert said.index("Most of all, what contradicts") < said.index("mean square error comes")
     changed["next_poses"] = {
@@ -784,6 +786,8 @@ def test_limits_in_words(record):
     said = " ".join(limits(changed))
     assert "targets out of the image plane (70 %), then range errors of the points (25 %)" in said
     assert "3 well-chosen images would help as much as 19 more" in said
+    held = changed | {"prior": "gaussian", "degrees_of_freedom": None}
+    assert limits(held)[0].startswith("By the SDs that were held fixed, the mean square error")
 
 
 def test_why_larger_residuals_are_believed(record):

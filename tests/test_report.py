@@ -342,6 +342,13 @@ def test_lists_have_headings_with_room_before_them():
         "- short",
         "An end:",
     ]
+    # A number stays with its unit.
+    assert laid_out(["about 90 % of them or 3 mm"], 8).splitlines() == [
+        "about",
+        "90 % of",
+        "them or",
+        "3 mm",
+    ]
 
 
 def test_verdict_gives_zero_no_sign(record):

@@ -164,9 +164,18 @@ def _sds_not_tuned(result: Calibration) -> list[str]:
     found = []
     used = int(result.images_used)
     if result.prior in TUNED and not result.sigma_tuned:
-        text = "noise SDs were held fixed, not estimated"
+        sizes = ", ".join(
+            f"{kind} {size:.3g}" for kind, size in zip(KINDS, np.asarray(result.sigma), strict=True)
+        )
+        text = (
+            f"noise SDs were held fixed ({sizes} mm), not estimated, and the stated error rests on "
+            "them"
+        )
         if used < MINIMUM_SELF_TUNING:
-            text += f": this takes at least {MINIMUM_SELF_TUNING} images, and {used} are used"
+            text += (
+                f": to estimate them takes at least {MINIMUM_SELF_TUNING} images, and {used} are "
+                "used"
+            )
         found.append(text)
     if np.any(result.sigma_floored):
         errors = zip(KINDS, result.sigma_floored, strict=True)

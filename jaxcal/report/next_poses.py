@@ -98,8 +98,8 @@ def next_poses_sentences(record: dict[str, Any]) -> list[str]:
     form = next((f for f in (".2f", ".3f", ".4f") if f"{now:{f}}" != f"{then:{f}}"), ".2g")
     gain = f" that reduce the {error} from {now:{form}} to {then:{form}} mm" if stated else ""
     lines = listed(
-        f"What would help most: {len(found['poses'])} images{gain}. From the middle orientation, "
-        "with the marker to your right",
+        f"Which images to add: {len(found['poses'])}{gain}. From the middle orientation, with the "
+        "marker to your right",
         [pose["words"] for pose in found["poses"]],
     )
     if stated and found["images_to_half"] is not None:

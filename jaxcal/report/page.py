@@ -234,7 +234,7 @@ def _findings(record: dict[str, Any]) -> str:
     if todo := advice(record):
         parts += ["<h3>What to do</h3>", as_html([BULLET + text for text in todo])]
     if more := next_poses_sentences(record):
-        parts += ["<h3>Which images to add</h3>", as_html(more)]
+        parts += ["<h3>Further images</h3>", as_html(more)]
     return _section("What to look at, and what to do", *parts) if parts else ""
 
 

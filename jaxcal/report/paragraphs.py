@@ -30,15 +30,14 @@ def laid_out(lines: Sequence[str], width: int) -> str:
             told.append("")
         indent = " " * len(BULLET) if here.startswith(BULLET) else ""
         # Paths and options stay whole, so that they can be copied.
-        told.append(
-            textwrap.fill(
-                here,
-                width,
-                subsequent_indent=indent,
-                break_long_words=False,
-                break_on_hyphens=False,
-            )
+        filled = textwrap.fill(
+            _UNITS.sub(r"\1\0\2", here),
+            width,
+            subsequent_indent=indent,
+            break_long_words=False,
+            break_on_hyphens=False,
         )
+        told.append(filled.replace("\0", " "))
     return "\n".join(told)
 
 

@@ -218,7 +218,8 @@ def limits(record: dict[str, Any]) -> list[str]:
     if shares:
         ranked = sorted(shares.items(), key=lambda item: -item[1])
         named = [f"{_KINDS[kind]} ({100 * share:.0f} %)" for kind, share in ranked if share >= 0.1]
-        lines.append(f"The mean square error comes mainly from {', then '.join(named)}.")
+        the = "By the SDs that were held fixed, the" if _sds_held(record) else "The"
+        lines.append(f"{the} mean square error comes mainly from {', then '.join(named)}.")
     poses = _poses(record)
     if poses:
         lines.append(poses)
@@ -241,6 +242,11 @@ def limits(record: dict[str, Any]) -> list[str]:
                 f"Leaving out one of these images would change the calibration most: {told}."
             )
     return lines
+
+
+def _sds_held(record: dict[str, Any]) -> bool:
+    """Whether the errors' SDs were given or assumed, and not estimated."""
+    return record["prior"] in TUNED and record["degrees_of_freedom"] is None
 
 
 def scatter(record: dict[str, Any]) -> list[str]:
@@ -318,8 +324,9 @@ def believe(record: dict[str, Any]) -> list[str]:
     lines = [first]
     if beside["conventional_tre_mm"] is not None and beside["tre_mm"] is not None:
         equal, own = _mm(beside["conventional_tre_mm"]), _mm(beside["tre_mm"])
+        sizes = "sizes that were held fixed" if _sds_held(record) else "estimated sizes"
         lines.append(
-            "With independent Gaussian errors of the estimated sizes (assumed for this comparison "
+            f"With independent Gaussian errors of the {sizes} (assumed for this comparison "
             f"only), a fit with equal weights has an expected error of {equal}"
             + (
                 f", one with weights from these sizes {own}."
@@ -388,7 +395,8 @@ def _addition(record: dict[str, Any]) -> str:
     first = record["observability"].get("advice")
     if not first:
         return _MORE_VARIED
-    return f"{first[0].upper()}{first[1:]}. {_BEYOND}"
+    told = f"{first[0].upper()}{first[1:]}."
+    return f"{told} {_BEYOND}" if first.startswith("add ") else told
 
 
 def _out_of_plane(record: dict[str, Any]) -> bool:
@@ -438,6 +446,11 @@ def advice(record: dict[str, Any]) -> list[str]:
         advice.append(
             "Look at the images that are named, and correct their points or leave them out; "
             "--robust leaves them out if they are few."
+        )
+    elif (record.get("tre") or {}).get("contradictions"):
+        advice.append(
+            "First see to what contradicts the noise model: what it may be is said above. Add "
+            "images only if nothing is left of it."
         )
     elif not record.get("doubtful_unit") and (few or record["verdict"] == "uncertain"):
         advice.append(_addition(record))
