@@ -186,6 +186,26 @@ def test_the_command_tells_who_agrees(files, capsys):
     assert pairs[0]["points"] == [[100, 300], [390, 490]]
 
 
+def test_some_of_many_pairs_may_be_apart_by_chance(tmp_path, capsys):
+    """Of ten right calibrations one in two has a pair beyond 95 %; few have one beyond chance."""
+    covariance = np.diag([0.1, 0.1, 0.1, 1e-3, 1e-3, 1e-3]) ** 2
+    rng = np.random.default_rng(0)
+    status, beyond = [], []
+    for _ in range(10):
+        names = []
+        for k, step in enumerate(rng.multivariate_normal(np.zeros(6), covariance, size=8)):
+            names.append(str(tmp_path / f"{k}.json"))
+            ImageTransform(place() @ twist(step), SCALE, covariance=covariance).save(names[-1])
+        status.append(main(["compare", *names, *PIXELS]))
+        page = " ".join(capsys.readouterr().out.split())
+        beyond.append(" 0 of 28 pairs" not in page)
+        assert ("than any of so many is by chance" in page) == (status[-1] == 5)
+    assert sum(beyond) >= 5
+    assert status.count(5) <= 2
+    main(["compare", names[0], names[0], names[1], *PIXELS])
+    assert "the same" in capsys.readouterr().out
+
+
 def test_a_verdict_that_expects_larger_errors_is_told(files, capsys):
     known = jaxcal.load_calibration(files[2])
     replace(known, tre_factor=2.8).save(files[2])

@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from jaxcal.cli.common import ExitCode, json_option, print_json, print_page, simple_table
+from jaxcal.runtime.messages import counted
 
 if TYPE_CHECKING:
     from rich.table import Table
 
     from jaxcal.diagnostics.comparison import Comparison
+    from jaxcal.result.transform import ImageTransform
 
 MOST_FILES = 100
 """Most calibrations that are compared at once, each with each."""
@@ -41,7 +43,8 @@ def compare(
 
     Each CAL is a calibration.json of "jaxcal calibrate --out", or any other file that "jaxcal
     export" writes. They must be of the same probe and marker, from different recordings. The status
-    is 5 if two of them are farther apart than 95 % of such pairs would be by their covariances; few
+    is 5 if two of them are farther apart than 95 % of such pairs would be by their covariances; of
+    more calibrations, if two are farther apart than the farthest two would be in 95 % of cases. Few
     images, which leave the size of the errors uncertain, are allowed for. If the verdict of one
     expects larger errors than its covariance says, the factor is told.
     """
@@ -49,9 +52,8 @@ def compare(
 
     from jaxcal import InputError
     from jaxcal.diagnostics.comparison import compare_calibrations
-    from jaxcal.report.differences import what_differs
-    from jaxcal.result.saved import load_calibration, stated_doubt, stated_points, stated_source
-    from jaxcal.runtime.messages import quoted
+    from jaxcal.diagnostics.intervals import LEVEL
+    from jaxcal.result.saved import load_calibration, stated_points
 
     if not 2 <= len(calibrations) <= MOST_FILES:
         raise click.UsageError(f"name 2 to {MOST_FILES} calibrations, not {len(calibrations)}")
@@ -64,29 +66,34 @@ def compare(
             "none of these files says which part of the image was used: name points of the image "
             "by --pixel U V"
         )
-    named = zip(calibrations, transforms, strict=True)
-    pairs = [
-        (first, second, compare_calibrations(one, other, points))
-        for (first, one), (second, other) in combinations(named, 2)
-    ]
-    sources = [stated_source(name) for name in calibrations]
-    shared = sorted({name for name in sources if name and sources.count(name) > 1})
-    factors = {name: made.tre_factor for name, made in zip(calibrations, transforms, strict=True)}
-    notes = [
-        f"The verdict of {name} expects errors {factor:.1f} times as large as its "
-        "covariance says. The expected distances do not include this."
-        for name, factor in factors.items()
-        if factor > 1
-    ]
-    doubts = [(name, stated_doubt(name)) for name in dict.fromkeys(calibrations)]
-    notes += [f"{name}: {doubt}." for name, doubt in doubts if doubt is not None]
-    notes += [
-        f"Several calibrations state that they were made from {quoted(name)}. If that is one "
-        "recording, they share its errors, and their distance says nothing about their accuracy."
-        for name in shared
-    ]
-    one = len(pairs) == 1
-    whose = ["the first", "the second"] if one else list(calibrations)
+    each = list(combinations(zip(calibrations, transforms, strict=True), 2))
+    # Of many pairs some are beyond 95 % by chance.
+    level = 1 - (1 - LEVEL) / len(each)
+    pairs, clear = [], 0
+    for (first, one), (second, other) in each:
+        pairs.append((first, second, compare_calibrations(one, other, points)))
+        clear += compare_calibrations(one, other, points, level=level).agree is False
+    notes = _notes(calibrations, transforms)
+    if as_json:
+        found = [_record(*pair) for pair in pairs]
+        named = zip(calibrations, transforms, strict=True)
+        factors = {name: made.tre_factor for name, made in named}
+        print_json({"pairs": found, "tre_factor": factors, "notes": notes})
+    elif len(pairs) == 1:
+        unit = "mm" if transforms[0].scale_mm_per_px is None else "px"
+        print_page(_table_of_points(pairs[0][2], unit), _sentence(pairs[0][2]), *notes)
+    else:
+        print_page(_table_of_pairs(pairs), _summary([pair[2] for pair in pairs], clear), *notes)
+    return ExitCode.UNCERTAIN if clear else ExitCode.CONVERGED
+
+
+def _notes(calibrations: tuple[str, ...], transforms: list[ImageTransform]) -> list[str]:
+    """What the calibrations should have in common and do not, and what their files say of them."""
+    from jaxcal.report.differences import what_differs
+    from jaxcal.result.saved import stated_doubt, stated_source
+    from jaxcal.runtime.messages import quoted
+
+    whose = ["the first", "the second"] if len(calibrations) == 2 else list(calibrations)
     notes = [
         differing
         for made, name in zip(transforms[1:], whose[1:], strict=True)
@@ -95,19 +102,22 @@ def compare(
             (transforms[0].scale_mm_per_px, made.scale_mm_per_px),
             (whose[0], name),
         )
-    ] + notes
-    if as_json:
-        found = [_record(*pair) for pair in pairs]
-        print_json({"pairs": found, "tre_factor": factors, "notes": notes})
-    else:
-        if one:
-            unit = "mm" if transforms[0].scale_mm_per_px is None else "px"
-            shown = _table_of_points(pairs[0][2], unit), _sentence(pairs[0][2])
-        else:
-            shown = _table_of_pairs(pairs), _summary([pair[2] for pair in pairs])
-        print_page(*shown, *notes)
-    apart = any(pair[2].agree is False for pair in pairs)
-    return ExitCode.UNCERTAIN if apart else ExitCode.CONVERGED
+    ]
+    for name, made in dict(zip(calibrations, transforms, strict=True)).items():
+        if made.tre_factor > 1:
+            notes.append(
+                f"The verdict of {name} expects errors {made.tre_factor:.1f} times as large as its "
+                "covariance says. The expected distances do not include this."
+            )
+        if (doubt := stated_doubt(name)) is not None:
+            notes.append(f"{name}: {doubt}.")
+    sources = [name for each in calibrations if (name := stated_source(each))]
+    notes += [
+        f"Several calibrations state that they were made from {quoted(name)}. If that is one "
+        "recording, they share its errors, and their distance says nothing about their accuracy."
+        for name in sorted({name for name in sources if sources.count(name) > 1})
+    ]
+    return notes
 
 
 def _record(first: str, second: str, found: Comparison) -> dict[str, Any]:
@@ -155,7 +165,8 @@ def _table_of_pairs(pairs: list[tuple[str, str, Comparison]]) -> Table:
     words = {True: "yes", False: "no", None: "-"}
     for first, second, found in pairs:
         numbers = (found.rms_mm, found.expected_rms_mm, found.limit_mm)
-        table.add_row(first, second, *map(_millimetres, numbers), words[found.agree])
+        agree = "the same" if _are_same(found) else words[found.agree]
+        table.add_row(first, second, *map(_millimetres, numbers), agree)
     return table
 
 
@@ -183,7 +194,8 @@ def _sentence(found: Comparison) -> str:
     )
 
 
-def _summary(found: list[Comparison]) -> str:
+def _summary(found: list[Comparison], clear: int) -> str:
+    """Words for several pairs, ``clear`` of which are apart beyond what chance makes of all."""
     known = [each for each in found if each.agree is not None]
     worst = max(each.rms_mm for each in found)
     largest = f"The two that differ most put the image {worst:.2f} mm apart (RMS)"
@@ -194,5 +206,10 @@ def _summary(found: list[Comparison]) -> str:
     apart = sum(not each.agree for each in known)
     return (
         f"{largest}. {apart} of {len(known)} pairs are farther apart than 95 % of such pairs would "
-        f"be by their covariances; about {(1 - LEVEL) * len(known):.1f} are expected by chance."
+        f"be by their covariances; about {(1 - LEVEL) * len(known):.1f} are expected by chance. "
+        + (
+            f"{counted(clear, 'pair', 'is', 'are')} farther apart than any of so many is by chance."
+            if clear
+            else "None is farther apart than one of so many may be by chance."
+        )
     )

@@ -33,7 +33,7 @@ from jaxcal.result.calibration import Calibration
 from jaxcal.result.transform import ImageTransform
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.arrays import outline
-from jaxcal.runtime.given_values import check_made
+from jaxcal.runtime.given_values import check_made, is_number
 
 _LEAST_SHARE = 1e-6
 """Least share of the mean square at which a direction of the errors counts."""
@@ -50,7 +50,8 @@ class Comparison:
             NaN where one is not known.
         rms_mm: root mean square of ``apart_mm``, mm.
         expected_rms_mm: the same of ``expected_mm``, mm.
-        limit_mm: by both covariances, 95 % of such pairs have a smaller ``rms_mm``, mm.
+        limit_mm: by both covariances, 95 % of such pairs (or the share that was asked for) have a
+            smaller ``rms_mm``, mm.
         rotation_deg: angle between the two orientations of the image, degrees.
     """
 
@@ -74,6 +75,8 @@ def compare_calibrations(
     first: Calibration | ImageTransform,
     second: Calibration | ImageTransform,
     points: Float[np.ndarray, "m 2"] | Float[np.ndarray, " 2"],
+    *,
+    level: float = LEVEL,
 ) -> Comparison:
     """Map the same image points by two calibrations of one probe, and compare.
 
@@ -84,15 +87,20 @@ def compare_calibrations(
         first: a calibration, computed or from :func:`jaxcal.load_calibration`.
         second: another one; both take pixels, or both points in mm.
         points: [u, v] of image points, px, or [lateral, range] in mm; also a single one, (2,).
+        level: share of such pairs that are nearer than ``limit_mm``. Of k pairs that are all right,
+            none is farther apart than at 1 - 0.05 / k in 95 % of cases (Bonferroni).
 
     Returns:
         How far apart the points are, and what the covariances expect: a :class:`Comparison`.
 
     Raises:
         InputError: what is no calibration, a batch, one that must not be used, only one that takes
-            pixels, or points that :meth:`ImageTransform.apply` refuses.
+            pixels, a level that is not between 0 and 1, or points that
+            :meth:`ImageTransform.apply` refuses.
         CalibrationError: under a JAX transformation.
     """
+    if not (is_number(level) and 0 < level < 1):
+        raise InputError(f"level must be between 0 and 1, not {level!r}")
     first, second = _transform("first", first), _transform("second", second)
     if (first.scale_mm_per_px is None) != (second.scale_mm_per_px is None):
         without, other = first, second
@@ -108,7 +116,7 @@ def compare_calibrations(
     variances = np.trace(one.covariance + other.covariance, axis1=1, axis2=2)
     limit = np.nan
     if np.isfinite(variances).all():
-        limit = _limit(first, second, points)
+        limit = _limit(first, second, points, level)
     return Comparison(
         points=points,
         apart_mm=apart,
@@ -123,9 +131,9 @@ def compare_calibrations(
 
 
 def _limit(
-    first: ImageTransform, second: ImageTransform, points: Float[np.ndarray, "m 2"]
+    first: ImageTransform, second: ImageTransform, points: Float[np.ndarray, "m 2"], level: float
 ) -> float:
-    """The quantile :data:`~jaxcal.diagnostics.intervals.LEVEL` of the points' RMS distance, mm."""
+    """The quantile ``level`` of the points' RMS distance, mm."""
     both = (first, second)
     factors = [each.error_factor(points).reshape(3 * len(points), -1) for each in both]
     squares = np.array(
@@ -147,7 +155,7 @@ def _limit(
     spread = np.linalg.eigvalsh(factor.T @ factor / len(points))
     # Both move the points alike, so that half of these directions do nothing.
     spread = spread[spread >= _LEAST_SHARE * spread.sum()]
-    return float(length_quantile(spread[None], left, LEVEL)[0])
+    return float(length_quantile(spread[None], left, level)[0])
 
 
 def _combined_freedom(squares: Float[np.ndarray, " 2"], freedom: list[float]) -> float:
