@@ -9,7 +9,7 @@ Rotations that were built from angles in a wrong way are in :mod:`jaxcal.diagnos
 
 *Far better* means two things. Both fits have n images, p unknowns and errors of unknown size. With
 f the sum of squares as given and f' the corrected one, the likelihood ratio is
-(f / f')^((3 n - p) / 2). It must exceed ``ODDS``, so that chance is ruled out although a dozen
+(f / f')^((3 n - p) / 2). It must exceed ``ODDS``, so that chance is ruled out although some fifty
 corrections and two shifts by one row are tried. And f must exceed ``FACTOR`` times f', so that
 imperfect but correct data are not reported. If the images fit badly, poses and points are also
 shifted by up to half the recording, as where they were stamped by two clocks. That is up to six

@@ -301,7 +301,7 @@ def _poses(record: dict[str, Any]) -> str | None:
     gain = (more["tre_now_mm"] / more["tre_then_mm"]) ** 2 - 1
     alike, count = gain * record["images_used"], len(more["poses"])
     if alike < 2 * count:
-        return "The poses are well chosen: only a larger number of images would help."
+        return "The poses are well chosen: others would hardly help more than further ones like these."
     return (
         f"The poses: {count} well-chosen images would help as much as {alike:.0f} more of the same "
         "kind."
@@ -449,8 +449,8 @@ def advice(record: dict[str, Any]) -> list[str]:
         )
     elif (record.get("tre") or {}).get("contradictions"):
         advice.append(
-            "First see to what contradicts the noise model: what it may be is said above. Add "
-            "images only if nothing is left of it."
+            "First see to what contradicts the noise model, which is said above; add images after "
+            "that."
         )
     elif not record.get("doubtful_unit") and (few or record["verdict"] == "uncertain"):
         advice.append(_addition(record))
