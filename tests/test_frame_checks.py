@@ -16,11 +16,11 @@ import jaxcal
 from jaxcal import Problem
 from jaxcal.cli.common import ExitCode, exit_code, verdict_code
 from jaxcal.cli.plan import refuse_wrong_lengths
-from jaxcal.data.poses import inverse_poses
+from jaxcal.data.poses import inverse_poses, vectors_from_rotations
 from jaxcal.data.recording import make_images
 from jaxcal.diagnostics.frame_checks import doubtful_unit, wrong_frames
 from jaxcal.diagnostics.warnings import warnings
-from jaxcal.diagnostics.wrong_angles import ORDERS, angles_about_axes, composed, vectors_of
+from jaxcal.diagnostics.wrong_angles import ORDERS, angles_about_axes, composed
 from jaxcal.io.text import read_crosswire
 from jaxcal.report.next_poses import next_poses_record
 from jaxcal.report.record import calibration_record
@@ -79,7 +79,7 @@ def test_angles_are_those_of_scipy(order):
 def test_rotation_vectors_are_those_of_scipy():
     turns = np.concatenate([Rotation.random(30, random_state=2).as_matrix(), np.eye(3)[None]])
     expected = Rotation.from_matrix(turns).as_rotvec()
-    np.testing.assert_allclose(vectors_of(turns), expected, atol=1e-9)
+    np.testing.assert_allclose(vectors_from_rotations(turns), expected, atol=1e-9)
 
 
 def test_mirrored_rotations_are_not_taken_for_mirrored_translations(slips):

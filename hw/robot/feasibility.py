@@ -38,7 +38,8 @@ from hw.robot.kinematics import (
     tool_of,
 )
 from hw.runtime.errors import RefusedError, refused
-from hw.runtime.rigid import rotation_vector, straight_way
+from hw.runtime.rigid import straight_way
+from jaxcal.data.poses import vectors_from_rotations
 from jaxcal.runtime.array_types import Float
 
 _COARSE_MM = 20.0
@@ -145,7 +146,7 @@ def follow(
             out of its box; the text says where on the way.
     """
     branch = int(branch_of(arm.model, joints))
-    turn = rotation_vector(goal[:3, :3] @ start[:3, :3].T)
+    turn = vectors_from_rotations(goal[:3, :3] @ start[:3, :3].T)
     travel = goal[:3, 3] - start[:3, 3]
     angle = float(np.linalg.norm(turn))
     lever_mm = float(np.linalg.norm(tool_of(arm.tcp_offset)[:3, 3]))

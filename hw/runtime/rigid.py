@@ -9,21 +9,11 @@ from __future__ import annotations
 import numpy as np
 
 from jaxcal.data.poses import (
-    quaternions_from_rotations,
     rotation_angle,
     rotations_from_vectors,
+    vectors_from_rotations,
 )
 from jaxcal.runtime.array_types import Float
-
-
-def rotation_vector(rotation: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n 3"]:
-    """Rotation vectors (rad, at most pi long) of orthonormal matrices."""
-    quaternion = quaternions_from_rotations(rotation)
-    vector = quaternion[..., :3]
-    sine = np.sqrt(np.sum(vector * vector, axis=-1, keepdims=True))
-    angle = 2.0 * np.arctan2(sine, quaternion[..., 3:])
-    tiny = sine < 1e-9
-    return vector * np.where(tiny, 2.0, angle / np.where(tiny, 1.0, sine))
 
 
 def turn_deg(first: Float[np.ndarray, "4 4"], second: Float[np.ndarray, "4 4"]) -> float:
@@ -76,7 +66,7 @@ def straight_way(
         parts: parts of the way, 0 to 1.
     """
     parts = np.asarray(parts, dtype=np.float64)[:, None]
-    turn = rotation_vector(goal[:3, :3] @ start[:3, :3].T)
+    turn = vectors_from_rotations(goal[:3, :3] @ start[:3, :3].T)
     way = rigid(parts * turn, start[:3, 3] + parts * (goal[:3, 3] - start[:3, 3]))
     way[:, :3, :3] = way[:, :3, :3] @ start[:3, :3]
     return way
@@ -106,4 +96,4 @@ def pose_to_ur(pose: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*bat
     """
     pose = np.asarray(pose, dtype=np.float64)
     position = pose[..., :3, 3] / 1000.0
-    return np.concatenate([position, rotation_vector(pose[..., :3, :3])], axis=-1)
+    return np.concatenate([position, vectors_from_rotations(pose[..., :3, :3])], axis=-1)

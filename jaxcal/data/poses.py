@@ -229,6 +229,17 @@ def quaternions_from_rotations(rotations: Float[np.ndarray, "*n 3 3"]) -> Float[
     return np.where(found[..., 3:] >= 0, found, -found)
 
 
+def vectors_from_rotations(rotations: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n 3"]:
+    """Rotation vectors, axis times angle (rad, at most pi), of rotation matrices."""
+    quaternions = quaternions_from_rotations(rotations)
+    vectors = quaternions[..., :3]
+    sine = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    angle = 2 * np.arctan2(sine, quaternions[..., 3:])
+    # For no rotation, twice the quaternion's vector.
+    tiny = sine < 1e-9
+    return vectors * np.where(tiny, 2.0, angle / np.where(tiny, 1.0, sine))
+
+
 def inverse_poses(poses: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 4 4"]:
     """The inverses of rigid transforms."""
     inverse = np.zeros_like(poses)

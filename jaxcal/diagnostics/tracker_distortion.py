@@ -35,7 +35,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxcal.data.poses import nearest_rotations, quaternions_from_rotations
+from jaxcal.data.poses import nearest_rotations, vectors_from_rotations
 from jaxcal.diagnostics.image_errors import ImageErrors
 from jaxcal.model.unknowns import block_slice
 from jaxcal.runtime.array_types import Bool, Float
@@ -77,10 +77,7 @@ def orientations(poses: Float[Array, "n 4 4"], used: Bool[Array, " n"]) -> Float
     """Rotation vectors a from the mean orientation; zeros if all orientations are the same."""
     turns = np.where(used[:, None, None], poses[:, :3, :3], np.eye(3))
     mean, _ = nearest_rotations(turns[used].mean(axis=0)[None])
-    quaternions = quaternions_from_rotations(np.swapaxes(mean, 1, 2) @ turns)
-    vector, length = quaternions[:, :3], np.linalg.norm(quaternions[:, :3], axis=1)
-    angle = 2 * np.arctan2(length, quaternions[:, 3])
-    vectors = vector * (angle / np.maximum(length, 1e-300))[:, None]
+    vectors = vectors_from_rotations(np.swapaxes(mean, 1, 2) @ turns)
     vectors = vectors - vectors[used].mean(axis=0)
     return vectors / max(np.sqrt(np.mean(vectors[used] ** 2)), 1e-300)
 

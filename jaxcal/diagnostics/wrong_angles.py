@@ -23,7 +23,7 @@ from itertools import permutations
 
 import numpy as np
 
-from jaxcal.data.poses import quaternions_from_rotations, rotations_from_vectors
+from jaxcal.data.poses import rotations_from_vectors, vectors_from_rotations
 from jaxcal.runtime.array_types import Float
 
 Order = tuple[int, int, int]
@@ -54,7 +54,7 @@ def with_other_angles(
                     f"place of {_product(right)}",
                     composed(angles, right),
                 )
-    vectors = vectors_of(rotations)
+    vectors = vectors_from_rotations(rotations)
     if np.degrees(np.linalg.norm(vectors, axis=1).max()) < FEW_DEGREES:
         words = "angles in radians were read as degrees: the poses hardly turn; convert them once"
         yield words, rotations_from_vectors(DEGREES * vectors)
@@ -80,16 +80,6 @@ def composed(angles: Float[np.ndarray, "n 3"], order: Order) -> Float[np.ndarray
     """The product of rotations about x, y and z (rad) in an order."""
     each = [rotations_from_vectors(angles[:, axis, None] * np.eye(3)[axis]) for axis in range(3)]
     return each[order[0]] @ each[order[1]] @ each[order[2]]
-
-
-def vectors_of(rotations: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3"]:
-    """Rotation vectors, rad, of at most half a turn."""
-    quaternions = quaternions_from_rotations(rotations)
-    length = np.linalg.norm(quaternions[:, :3], axis=1)
-    angle = 2 * np.arctan2(length, quaternions[:, 3])
-    # For no rotation, twice the quaternion's vector.
-    factor = np.where(length > 1e-12, angle / np.where(length > 1e-12, length, 1.0), 2.0)
-    return factor[:, None] * quaternions[:, :3]
 
 
 def _product(order: Order) -> str:

@@ -301,7 +301,9 @@ def _poses(record: dict[str, Any]) -> str | None:
     gain = (more["tre_now_mm"] / more["tre_then_mm"]) ** 2 - 1
     alike, count = gain * record["images_used"], len(more["poses"])
     if alike < 2 * count:
-        return "The poses are well chosen: others would hardly help more than further ones like these."
+        return (
+            "The poses are well chosen: others would hardly help more than further ones like these."
+        )
     return (
         f"The poses: {count} well-chosen images would help as much as {alike:.0f} more of the same "
         "kind."

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from hw.runtime.rigid import pose_to_ur, rotation_vector, turn_deg, ur_to_pose
+from hw.runtime.rigid import pose_to_ur, turn_deg, ur_to_pose
+from jaxcal.data.poses import vectors_from_rotations
 
 number = st.floats(-4.0, 4.0)
 
@@ -31,7 +32,7 @@ def test_rotation_vectors_keep_their_digits(angle):
     axes = np.random.default_rng(0).normal(size=(50, 3))
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
     rotations = Rotation.from_rotvec(angle * axes).as_matrix()
-    vectors = rotation_vector(rotations)
+    vectors = vectors_from_rotations(rotations)
     np.testing.assert_allclose(np.linalg.norm(vectors, axis=1), angle, rtol=1e-7, atol=1e-15)
     again = Rotation.from_rotvec(vectors).as_matrix()
     np.testing.assert_allclose(again, rotations, atol=1e-12)
