@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -28,48 +28,61 @@ def plan_figure(plan: Plan, wanted_mm: float | None = None) -> Figure:
     if wanted_mm is not None and not (is_number(wanted_mm) and wanted_mm > 0):
         raise InputError(f"the wanted error must be a positive number of mm, not {wanted_mm!r}")
     from matplotlib.figure import Figure
-    from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
     figure = Figure(figsize=(12.5, 4.2), dpi=130, layout="constrained")
-    image, cone, errors = (
-        figure.add_subplot(1, 3, 1),
-        figure.add_subplot(1, 3, 2, projection="polar"),
-        figure.add_subplot(1, 3, 3),
-    )
-    bounds, model = plan.candidates.constraints, plan.candidates.model
-    numbers = bounds.coordinates(plan.poses, model.image_to_probe, model.point)
-    filling = plan.filling
+    _places(plan, figure.add_subplot(1, 3, 1))
+    _tilts(plan, figure.add_subplot(1, 3, 2, projection="polar"))
+    _errors(plan, wanted_mm, figure.add_subplot(1, 3, 3))
+    return figure
+
+
+def _kinds(plan: Plan) -> tuple[tuple[np.ndarray, str, str, str], ...]:
+    """The poses that were chosen and those that fill space, with colour, shape and name."""
+    return (~plan.filling, _BLUE, "o", "chosen"), (plan.filling, _ORANGE, "^", "fills space")
+
+
+def _places(plan: Plan, panel: Any) -> None:
+    """Where the target is in the image, and the outline of the region."""
     edge = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]], float)
     steps = np.linspace(0, 1, 20)[:, None]
     outline = np.concatenate([a + steps * (b - a) for a, b in pairwise(edge)])
-    outline = bounds.region.place(outline)
-    image.plot(outline[:, 0], outline[:, 2], color=_GREY, linewidth=0.8)
-    for which, colour, shape, label in (
-        (~filling, _BLUE, "o", "chosen"),
-        (filling, _ORANGE, "^", "fills space"),
-    ):
+    outline = plan.candidates.constraints.region.place(outline)
+    panel.plot(outline[:, 0], outline[:, 2], color=_GREY, linewidth=0.8)
+    for which, colour, shape, label in _kinds(plan):
         places = plan.targets[which]
-        image.plot(places[:, 0], places[:, 2], shape, color=colour, markersize=4, label=label)
-        # Where the handle goes, as in words.py: the marker is to the right, the person below.
-        azimuth = np.arctan2(-numbers[which, 2], -numbers[which, 3])
-        tilt = np.degrees(np.hypot(numbers[which, 2], numbers[which, 3]))
-        cone.plot(azimuth, tilt, shape, color=colour, markersize=4, clip_on=False)
-    image.set(
+        panel.plot(places[:, 0], places[:, 2], shape, color=colour, markersize=4, label=label)
+    panel.set(
         xlabel="lateral (mm)", ylabel="depth (mm)", title="target in the image", aspect="equal"
     )
-    image.invert_yaxis()
+    panel.invert_yaxis()
     # Below the image: in it, the legend would hide targets.
-    image.legend(
+    panel.legend(
         fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, frameon=False
     )
-    cone.set_title("tilt of the handle (degrees)", pad=18)
+
+
+def _tilts(plan: Plan, panel: Any) -> None:
+    """Where the handle goes, as in words.py: the marker is to the right, the person below."""
+    model = plan.candidates.model
+    numbers = plan.candidates.constraints.coordinates(plan.poses, model.image_to_probe, model.point)
+    for which, colour, shape, _ in _kinds(plan):
+        w1, w2 = numbers[which, 2], numbers[which, 3]
+        tilt = np.degrees(np.hypot(w1, w2))
+        panel.plot(np.arctan2(-w1, -w2), tilt, shape, color=colour, markersize=4, clip_on=False)
+    panel.set_title("tilt of the handle (degrees)", pad=18)
     sides = ("towards\nthe marker", "away from you", "away from\nthe marker", "towards you")
-    cone.set_xticks(np.radians([0, 90, 180, 270]), sides, fontsize="small")
-    cone.tick_params(axis="x", pad=14)
-    rings = np.arange(10, cone.get_ylim()[1] + 1, 10)
+    panel.set_xticks(np.radians([0, 90, 180, 270]), sides, fontsize="small")
+    panel.tick_params(axis="x", pad=14)
+    rings = np.arange(10, panel.get_ylim()[1] + 1, 10)
     if len(rings):
-        cone.set_yticks(rings)
-    cone.tick_params(axis="y", labelsize="small")
+        panel.set_yticks(rings)
+    panel.tick_params(axis="y", labelsize="small")
+
+
+def _errors(plan: Plan, wanted_mm: float | None, panel: Any) -> None:
+    """Predicted errors against the number of images."""
+    from matplotlib.ticker import MaxNLocator, StrMethodFormatter
+
     count = plan.known.images + np.arange(len(plan.tre_mm))
     # Errors of the first few images are so large that they would hide the others.
     seen = count >= min(6, count[-1])
@@ -77,16 +90,15 @@ def plan_figure(plan: Plan, wanted_mm: float | None = None) -> Figure:
         (plan.tre_mm, _BLUE, "o-", "target registration error"),
         (plan.rp_mm, _ORANGE, "^-", "reconstruction precision"),
     ):
-        errors.plot(count[seen], values[seen], style, color=colour, markersize=3, label=label)
-    errors.set_xlim(count[seen][0] - 0.5, count[-1] + 0.5)
+        panel.plot(count[seen], values[seen], style, color=colour, markersize=3, label=label)
+    panel.set_xlim(count[seen][0] - 0.5, count[-1] + 0.5)
     if wanted_mm is not None:
-        errors.axhline(wanted_mm, color=_GREY, linewidth=0.8, linestyle="--", label="wanted")
-    errors.set(
+        panel.axhline(wanted_mm, color=_GREY, linewidth=0.8, linestyle="--", label="wanted")
+    panel.set(
         xlabel="images", ylabel="predicted error (mm)", yscale="log", title="how many images?"
     )
-    errors.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
-    for formatted in (errors.yaxis.set_major_formatter, errors.yaxis.set_minor_formatter):
+    panel.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
+    for formatted in (panel.yaxis.set_major_formatter, panel.yaxis.set_minor_formatter):
         formatted(StrMethodFormatter("{x:g}"))
-    errors.grid(alpha=0.3, which="both")
-    errors.legend(fontsize="small")
-    return figure
+    panel.grid(alpha=0.3, which="both")
+    panel.legend(fontsize="small")
