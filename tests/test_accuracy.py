@@ -835,6 +835,7 @@ def test_the_conventional_fit_predicts_images_with_the_variances_that_it_states(
     # Errors that are only rounding have no density.
     exact = jaxcal.calibrate(experiment(3, images=12, elevation_mm=0.0, noise_mm=0.0))
     assert record_of(exact)["comparison"]["log_density_gain"] is None
+    assert "the lateral, range and elevational errors are too small" in " ".join(exact.warnings)
 
 
 def test_exit_status_says_less_than_required(tmp_path, capfd):

@@ -39,6 +39,7 @@ from jaxcal.diagnostics.uncertainty import mm_at_target, nearest_unknown
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Bool, Float
 from jaxcal.runtime.given_values import check_flag, check_made, real_array, whole_number
+from jaxcal.runtime.messages import enumerated
 
 _SINGULAR = 1e-10
 """Eigenvalue ratio (scaled units, equal SDs) below which a direction is not determined."""
@@ -337,4 +338,4 @@ def _missing(candidates: Candidates, model: Model, null: Float[np.ndarray, "p j"
         noticed[name] = float(np.linalg.norm(rows @ null))
     most = max(noticed.values())
     named = [name for name, value in noticed.items() if value > 0.3 * most]
-    return f"add poses {', '.join(named[:-1])}{' and ' * bool(named[1:])}{named[-1]}"
+    return f"add poses {enumerated(named)}"

@@ -9,6 +9,7 @@ from jaxcal.result.calibration import Calibration, check_one
 from jaxcal.result.diagnostics import ADDITIONS
 from jaxcal.runtime.array_types import AnyArray
 from jaxcal.runtime.arrays import finite_or_none
+from jaxcal.runtime.messages import enumerated
 
 _LEADING = 0.35
 """An unknown is named if its part of a direction is longer than this share of it."""
@@ -90,9 +91,8 @@ def poses_to_add(result: Calibration) -> str:
     tilts = [name for name in TABLE["rotation"].axes if worth[f"tilt {name}"]]
     parts = []
     if tilts:
-        listed = " and ".join([", ".join(tilts[:-1]), tilts[-1]] if tilts[1:] else tilts)
-        plural = "axes" if tilts[1:] else "axis"
-        parts.append(f"poses tilted by 20 to 30 degrees about the {listed} {plural}")
+        axes = f"{enumerated(tilts)} {'axes' if tilts[1:] else 'axis'}"
+        parts.append(f"poses tilted by 20 to 30 degrees about the {axes}")
     if worth["depth"]:
         parts.append("images with the target nearer and farther")
     if worth["sideways"]:

@@ -12,6 +12,7 @@ from jaxcal.diagnostics.misfits import misfits
 from jaxcal.diagnostics.outliers import listed_outliers, outliers, suspects_in_words
 from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
 from jaxcal.result.calibration import Calibration, check_one
+from jaxcal.runtime.messages import enumerated
 from jaxcal.solvers.plan import TUNED
 
 IMPLAUSIBLE_RMS_MM = 10.0
@@ -183,7 +184,7 @@ def _sds_not_tuned(result: Calibration) -> list[str]:
         rest = "error is" if len(names) == 1 else "errors are"
         owner = "its SD is" if len(names) == 1 else "their SDs are"
         found.append(
-            f"the {' and '.join(names)} {rest} too small to estimate; {owner} at the lower limit"
+            f"the {enumerated(names)} {rest} too small to estimate; {owner} at the lower limit"
         )
     return found
 

@@ -33,6 +33,11 @@ def counted(count: int, noun: str, one: str = "", several: str = "") -> str:
     return f"{count} {noun} {one}".rstrip() if count == 1 else f"{count} {noun}s {several}".rstrip()
 
 
+def enumerated(words: Sequence[str]) -> str:
+    """Words one after the other: ``a``, ``a and b`` or ``a, b and c``."""
+    return " and ".join([", ".join(words[:-1]), words[-1]] if words[1:] else words)
+
+
 def seconds(moment: float) -> str:
     """A time stamp, to the millisecond also where it counts from 1970, for a message."""
     return f"{moment:.3f} s"
