@@ -818,6 +818,21 @@ def test_apply_tells_of_ranges_that_begin_elsewhere(saved, tmp_path, capsys):
         assert (told in capsys.readouterr().err) == (offset != known.face_offset_mm)
 
 
+def test_apply_says_how_a_table_has_points_in_mm(tmp_path, capsys):
+    random_transform(scale=None).save(tmp_path / "mm.json")
+    (tmp_path / "px.csv").write_text("u,v\n1,50\n")
+    (tmp_path / "mm.csv").write_text("u_mm,v_mm\n1,50\n")
+    given = ["apply", str(tmp_path / "mm.json")]
+    assert main([*given, str(tmp_path / "px.csv")]) == 2
+    said = capsys.readouterr().err
+    assert "holds pixels, the calibration takes points in mm (a table with them has u_mm" in said
+    assert main([*given, str(tmp_path / "mm.csv")]) == 0
+    raw = jaxcal.simulate_recording(jaxcal.Protocol(images=4, raw=True))
+    jaxcal.save(raw, tmp_path / "raw.h5")
+    assert main([*given, str(tmp_path / "raw.h5")]) == 2
+    assert "holds times of flight, the calibration takes points in mm" in capsys.readouterr().err
+
+
 def test_apply_tells_that_the_verdict_expects_more_than_the_covariance_says(tmp_path, capsys):
     recording = jaxcal.simulate_recording(jaxcal.Protocol(images=40), seed=3)
     points = np.array(recording.calibration.measurements)

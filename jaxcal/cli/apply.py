@@ -22,6 +22,7 @@ _COLUMNS = (
     "cov_xz_mm2",
     "cov_yz_mm2",
 )
+_HELD = {"pixel": "pixels", "point": "points in mm", "time_of_flight": "times of flight"}
 
 
 @click.command(short_help="Take image points through a calibration, with their SDs.")
@@ -83,8 +84,10 @@ def apply(
         points, poses, kind, numbers, spacing, frame, origin = _read(source, table)
         pixels = transform.scale_mm_per_px is not None
         if kind != ("pixel" if pixels else "point"):
-            wanted = "pixels" if pixels else "points in mm"
-            raise InputError(f"{source}: holds {kind} data, the calibration takes {wanted}")
+            # A table's u and v are pixels unless its header says that they are not.
+            hint = "" if pixels or kind != "pixel" else " (a table with them has u_mm and v_mm)"
+            held, wanted = _HELD[kind], _HELD["pixel" if pixels else "point"]
+            raise InputError(f"{source}: holds {held}, the calibration takes {wanted}{hint}")
         names, sizes = (transform.probe_frame, frame), (transform.scale_mm_per_px, spacing)
         ours = transform.face_offset_mm
         origins = ours, ours if origin is None else origin
