@@ -20,7 +20,7 @@ from jaxcal.diagnostics.unmodelled import likelihood_ratio, unmodelled
 from jaxcal.model.image_points import distance
 from jaxcal.report.accuracy import region_of
 from jaxcal.report.record import calibration_record
-from jaxcal.report.verdict import advice
+from jaxcal.report.verdict import advice, verdict
 
 IMAGES = 40
 
@@ -521,8 +521,12 @@ def test_a_second_echo_in_forty_per_cent_of_the_images_is_told_of(answers):
     for result in (plain, jaxcal.calibrate(spoilt, prior="gaussian", robust=True)):
         record = calibration_record(result, spoilt)
         assert record["verdict"] == "uncertain"
-        assert any("two groups" in words for words in record["tre"]["contradictions"])
+        contradicted = " ".join(record["tre"]["contradictions"])
+        # Named in one way, and not once more by what follows from it.
+        assert ("another echo" in contradicted) != ("two groups" in contradicted)
         assert any("come in two groups" in words for words in misfits(result))
+        told = "come in two groups" in " ".join(verdict(record))
+        assert told == ("two groups" in contradicted)
 
 
 def test_images_left_out_that_agree_among_themselves_are_told_of():

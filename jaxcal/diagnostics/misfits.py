@@ -16,6 +16,8 @@ set in 170 has such a score among its nine."""
 DRIFT_SCORE = 2.8
 """The same limit for correlation in time. Without such correlation, one data set in 45 has a score
 beyond this, among three scores of successive images and three of the trend."""
+WITHIN_THE_IMAGE = ("lateral errors", "range errors")
+"""Errors within the image, in the order of the residuals."""
 LARGEST_OF_GROUPS = 1.5
 """Errors with a larger kurtosis are not called two groups."""
 
@@ -39,7 +41,7 @@ def misfits(result: Calibration) -> list[str]:
     scores = np.asarray(result.inspection.misfit, dtype=float)
     kurtosis = np.asarray(result.inspection.kurtosis, dtype=float)
     found = []
-    for k, name in enumerate(("lateral errors", "range errors", "elevational offsets")):
+    for k, name in enumerate((*WITHIN_THE_IMAGE, "elevational offsets")):
         tails, skewness, depth, _, _ = scores[:, k]
         if tails > MISFIT_SCORE:
             found.append(
@@ -47,7 +49,7 @@ def misfits(result: Calibration) -> list[str]:
                 "Gaussian 3)"
             )
         # Offsets may have edges of their own.
-        if k < 2 and in_two_groups(tails, kurtosis[k]):
+        if name in WITHIN_THE_IMAGE and in_two_groups(tails, kurtosis[k]):
             found.append(
                 f"the {name} come in two groups (kurtosis {kurtosis[k]:.1f}, Gaussian 3): two "
                 "targets, or a second echo?"

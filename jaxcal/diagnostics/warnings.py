@@ -15,6 +15,8 @@ from jaxcal.result.calibration import Calibration, check_one
 from jaxcal.runtime.messages import enumerated
 from jaxcal.solvers.plan import TUNED
 
+MISFIT = "noise model"
+"""A warning of :func:`jaxcal.diagnostics.misfits.misfits` begins with this."""
 IMPLAUSIBLE_RMS_MM = 10.0
 """Residuals with a larger root mean square do not come from a target within the beam."""
 CARELESS_MM = 1.5
@@ -71,7 +73,7 @@ def warnings(result: Calibration) -> list[str]:
         *_medium_warnings(result),
         *_unusual_pixels(result),
         *_far_from_probe(result),
-        *(f"noise model: {text}" for text in (misfits(result) if converged else [])),
+        *(f"{MISFIT}: {text}" for text in (misfits(result) if converged else [])),
         *(suspects_in_words(result) if converged else []),
         *_misfitting_images(result),
     ]

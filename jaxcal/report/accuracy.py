@@ -293,7 +293,7 @@ def settle(record: dict[str, Any]) -> None:
     told = contradictions(record)
     factor = max([1.0, *(times for times, _ in told)])
     tre["factor"] = factor
-    tre["contradictions"] = [words for _, words in told]
+    tre["contradictions"] = [words for _, words in told if words]
     tre["rms_mm"] = factor * tre["stated_mm"]
     tre["interval_95_mm"] = [factor * end for end in tre["stated_interval_mm"]]
     for point in tre["points"]:

@@ -9,8 +9,15 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from jaxcal.diagnostics.warnings import WEAK_MM, rests_on
-from jaxcal.report.contradictions import MOST_IMAGES, SLOW, images_named, outlying_test_images
+from jaxcal.diagnostics.misfits import WITHIN_THE_IMAGE
+from jaxcal.diagnostics.warnings import MISFIT, WEAK_MM, rests_on
+from jaxcal.report.contradictions import (
+    MOST_IMAGES,
+    SHIFTS,
+    SLOW,
+    images_named,
+    outlying_test_images,
+)
 from jaxcal.report.paragraphs import listed
 from jaxcal.report.resampled import resampled_sentences
 from jaxcal.result.saved import ASKED_FOR
@@ -49,7 +56,7 @@ def verdict(record: dict[str, Any]) -> list[str]:
     lines = [headline(record)]
     if usable(record):
         lines += [*why_larger(record), *where(record)]
-    further = [text for text in record["warnings"] if text not in lines[0]]
+    further = [text for text in _unexplained(record) if text not in lines[0]]
     lines += [*listed("Look at this", further), *listed("What to do", advice(record))]
     if usable(record):
         lines += listed("What limits it", limits(record))
@@ -57,6 +64,14 @@ def verdict(record: dict[str, Any]) -> list[str]:
         lines += listed("How the images agree with it", [*scatter(record), *believe(record)])
         lines += listed("Which images", frames_of_images(record))
     return lines
+
+
+def _unexplained(record: dict[str, Any]) -> list[str]:
+    """Warnings but for misfits of errors within the image that a named error explains."""
+    if not usable(record) or _unmodelled(record).get("kind") not in SHIFTS:
+        return record["warnings"]
+    effects = tuple(f"{MISFIT}: the {name}" for name in WITHIN_THE_IMAGE)
+    return [text for text in record["warnings"] if not text.startswith(effects)]
 
 
 def usable(record: dict[str, Any]) -> bool:
