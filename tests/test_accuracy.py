@@ -42,7 +42,7 @@ from jaxcal.model.unknowns import (
 from jaxcal.report.accuracy import FAIR_MM, GOOD_MM, region_of, settle
 from jaxcal.report.contradictions import _explanation
 from jaxcal.report.in_memory import record_of, recording_of
-from jaxcal.report.next_poses import next_poses_sentences, pose_records
+from jaxcal.report.next_poses import next_poses_record, next_poses_sentences, pose_records
 from jaxcal.report.record import _precision, calibration_record
 from jaxcal.report.resampled import resampled_sentences
 from jaxcal.report.tables import calibration_table
@@ -832,9 +832,13 @@ def test_the_conventional_fit_predicts_images_with_the_variances_that_it_states(
     gain = influence_of(answer).log_density.sum() - influence_of(alone).log_density.sum()
     assert beside["log_density_gain"] == pytest.approx(gain, rel=1e-6)
     # Errors that are only rounding have no density.
-    exact = jaxcal.calibrate(experiment(3, images=12, elevation_mm=0.0, noise_mm=0.0))
+    recording = experiment(3, images=12, elevation_mm=0.0, noise_mm=0.0)
+    exact = jaxcal.calibrate(recording)
     assert record_of(exact)["comparison"]["log_density_gain"] is None
     assert "the lateral, range and elevational errors are too small" in " ".join(exact.warnings)
+    # Nor do they tell a distribution, or which poses would help.
+    assert "too small to tell their distribution" in " ".join(exact.verdict())
+    assert next_poses_record(exact, recording) is None
 
 
 def test_exit_status_says_less_than_required(tmp_path, capfd):

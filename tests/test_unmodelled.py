@@ -529,6 +529,11 @@ def test_a_second_echo_in_forty_per_cent_of_the_images_is_told_of(answers):
         assert told == ("two groups" in contradicted)
 
 
+def test_data_without_noise_do_not_look_distorted():
+    recording = experiment(1, images=IMAGES, elevation_mm=1.0, noise_mm=0.0)
+    assert unmodelled(jaxcal.calibrate(recording, prior="gaussian")) == []
+
+
 def test_images_left_out_that_agree_among_themselves_are_told_of():
     recording = clean(2)
     points = recording.calibration.measurements.copy()

@@ -85,7 +85,10 @@ def offset_law(result: Calibration) -> dict[str, object] | None:
     if weighed:
         wrong = _contradicted(result)
         considered = ("uniform",) if result.prior == "uniform" else FAMILIES
-        words = _law_in_words({name: probability[name] for name in considered}, wrong)
+        if np.asarray(result.sigma_floored)[2]:
+            words = "The offsets are too small to tell their distribution"
+        else:
+            words = _law_in_words({name: probability[name] for name in considered}, wrong)
         if mean_probability > 0.5:
             words += f", about a mean of {float(law.mean):.2f} +- {float(law.mean_sd):.2f} mm"
         noise = "each image's own covariance" if own > 0.5 else "the same SDs in all images"

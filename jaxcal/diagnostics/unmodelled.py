@@ -105,6 +105,9 @@ _BY_CHANCE = {
 """What 2 ln LR exceeds by chance in one of a thousand recordings: chi squared, for m^2, which is
 never negative, that of two in a thousand, and for steps and random fields the limits of the
 module's head."""
+SMALLEST_FIELD_MM = 0.05
+"""A smaller distortion, or motion on the probe, is not named: every tracker has one, and in data
+without noise what the linearisation leaves out looks like one."""
 _AT_ONCE = ("step", "displaced")
 """Errors that begin with one image; where is looked for."""
 _PLACES = 16
@@ -447,10 +450,10 @@ def _random_fields(
         columns = field.columns()
         errors, rows = _in_sds(answer, seen, used, [columns])
         best = _fit_field(kind, field.places[used], errors, rows, start, columns.shape[-1])
-        if best is not None:
-            size = np.array([field.size(used, best.variance)])
+        size = 0.0 if best is None else field.size(used, best.variance)
+        if best is not None and size >= SMALLEST_FIELD_MM:
             step = np.sqrt(best.variance) * best.response
-            found.append(Unmodelled(kind, size, best.statistic, step))
+            found.append(Unmodelled(kind, np.array([size]), best.statistic, step))
     return found
 
 

@@ -13,6 +13,8 @@ from jaxcal.result.calibration import Calibration
 
 COUNT = 3
 _CANDIDATES = 2000
+EXACT_MM = 1e-3
+"""With a smaller error no further pose is of use: no tracker and no image is as exact."""
 NOT_PLANNED = "delay"
 """The unknown with which no poses are planned: it and the axial translation compensate each other.
 Both then have large SDs, and an image point a small one, which a plan would predict wrongly."""
@@ -45,7 +47,7 @@ def next_poses_record(
         plan = design.next_poses(result, candidates, COUNT)
     except InputError:
         return None
-    if not np.isfinite(plan.tre_mm).all():
+    if not (np.isfinite(plan.tre_mm).all() and plan.tre_mm[0] >= EXACT_MM):
         return None
     try:
         half = design.images_to(result, 0.5 * float(plan.tre_mm[0]), candidates)
