@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -230,6 +231,26 @@ def test_a_move_that_is_refused_at_the_last_moment_leaves_the_watchdog_at_rest(m
     sent = [name for name, *_ in controller.method_calls if name.startswith(("watch", "move"))]
     assert sent == ["watch_motion", "watch_rest"]
     assert caller.tell.call_args.kwargs["kind"] == "StaleError"
+
+
+def test_a_kick_that_hangs_ends_the_process_as_any_command_does(monkeypatch):
+    """It held the process for two seconds where a paused program did not take it."""
+    inputs = Mock(spec=Inputs, program_ended=False)
+    inputs.sample.age_s.return_value = 0.0
+    controller = Controller(
+        Setup("127.0.0.1", PLAN, None, CLOCK, False, 0.15), inputs, Mock(spec=Caller)
+    )
+    monkeypatch.setattr(controller, "_connection", lambda: (1, 100))
+    left: list[float] = []
+
+    def kick() -> bool:
+        left.append(signal.getitimer(signal.ITIMER_REAL)[0])
+        return True
+
+    controller.rtde_control = Mock(kickWatchdog=kick)
+    controller.kick()
+    assert 0.0 < left[0] <= 0.4
+    assert signal.getitimer(signal.ITIMER_REAL)[0] == 0.0
 
 
 def test_a_name_with_several_addresses_is_reached_at_the_one_that_answers(monkeypatch):

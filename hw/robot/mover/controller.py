@@ -86,21 +86,14 @@ class Controller:
         Args:
             name: of ur_rtde's function.
             values: its arguments.
-            within_s: the process ends if no answer comes for so long (wall s), counted from what
-                came last; the caller is told why by the signal that ended it.
+            within_s: see :meth:`_call`.
 
         Raises:
             Ended: the controller's program has stopped, or its answers are lost.
         """
         self.check_answers()
         self.log(name, values=values)
-        outer_s, _ = signal.getitimer(signal.ITIMER_REAL)
-        wait_s = max(_LEAST_WAIT_S, within_s - self._connection()[1] / 1000)
-        signal.setitimer(signal.ITIMER_REAL, min(wait_s, outer_s or wait_s))
-        try:
-            return self._call(name, *values)
-        finally:
-            signal.setitimer(signal.ITIMER_REAL, outer_s)
+        return self._call(name, *values, within_s=within_s)
 
     def check_answers(self) -> None:
         """Check that ur_rtde hears the controller: its commands wait for answers for seconds.
@@ -122,16 +115,29 @@ class Controller:
         """Whether the control connection stands; ur_rtde may notice later that it does not."""
         return self.rtde_control.isConnected() and self._connection()[0] == _ESTABLISHED
 
-    def _call(self, name: str, *values: object) -> object:
+    def _call(self, name: str, *values: object, within_s: float = _UNHEARD_S) -> object:
+        """Call a function of ur_rtde.
+
+        The process ends if no answer comes for ``within_s`` (wall s), counted from what came last;
+        the caller is told why by the signal that ended it.
+
+        Raises:
+            Ended: the controller's program has stopped.
+        """
         if self._inputs.sample.age_s(self._clock.now()) > self._max_age_s:
             # The controller is silent: ur_rtde would spin for seconds at real-time priority.
             be_prompt(0)
+        outer_s, _ = signal.getitimer(signal.ITIMER_REAL)
+        wait_s = max(_LEAST_WAIT_S, within_s - self._connection()[1] / 1000)
+        signal.setitimer(signal.ITIMER_REAL, min(wait_s, outer_s or wait_s))
         try:
             return getattr(self.rtde_control, name)(*values)
         except RuntimeError as error:
-            raise Ended(self.program_stopped(said(error))) from None
+            failure = said(error)
         finally:
+            signal.setitimer(signal.ITIMER_REAL, outer_s)
             be_prompt(ASKS)
+        raise Ended(self.program_stopped(failure))
 
     def log(self, command: str, **numbers: object) -> None:
         """Tell the caller of a command, or of what stands for one."""
