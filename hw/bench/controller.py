@@ -110,6 +110,8 @@ class Controller:
     """A fault: motions are so many times as fast as commanded."""
     heeds_stops: bool = True
     """Unless a fault: commands to stop are taken, but the arm goes on."""
+    pauses_before: int | None = None
+    """A command's code: the program is paused at the moment in which it would take that command."""
     speed_fraction: float = 1.0
     """Position of the speed slider, 0 to 1."""
     told: Callable[[str, bool], None] = field(default=lambda reason, fault: None, repr=False)
@@ -254,7 +256,10 @@ class Controller:
             self._waits_for = None
             self.int_out[0] = DONE
         command = self.int_in[0]
-        if command == 0:
+        if command == self.pauses_before:
+            self.pauses_before = None
+            self.pause(t, True)
+        elif command == 0:
             self._latched = False
             self.int_out[0] = READY
         elif command in _REAL_TIME:

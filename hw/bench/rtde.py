@@ -179,7 +179,8 @@ class RtdeServer:
         - ``force`` (N and N m): on the tool;
         - ``remote`` (on): remote or local control of an e-Series;
         - ``play``: our program ends, and soon another one runs;
-        - ``pause`` (on): our program is paused, or goes on;
+        - ``pause`` (on): our program is paused, or goes on; ``pause before`` (code): it is paused
+          when it would take this command next;
         - ``tcp_offset`` (m, rad), ``payload`` (kg and, or not, its centre of gravity, m),
           ``speed_slider`` (0 to 1): other settings at the pendant;
         - ``overspeed`` (factor): motions from now on are so many times as fast as commanded;
@@ -222,6 +223,8 @@ class RtdeServer:
                 program.play(t)
             case ["pause", on]:
                 program.pause(t, bool(on))
+            case ["pause before", code]:
+                program.pauses_before = code
             case ["tcp_offset", offset]:
                 self.arm.set_tcp_offset(offset)
             case ["payload", mass_kg, *cog_m]:

@@ -27,6 +27,8 @@ from hw.runtime.errors import LostError
 from jaxcal.runtime.messages import quoted
 
 DASHBOARD_PORT, PRIMARY_PORT = 29999, 30001
+STOP_PATIENCE_S = 0.3
+"""Longest wait (wall s) for the dashboard to stop a program: somebody waits to be told of it."""
 
 ROBOT_STATE, KINEMATICS_INFO = 16, 5
 """Types of the primary interface's message and of its part that holds the kinematics."""
@@ -138,12 +140,16 @@ def until_local(
 
 
 def stop_program(
-    host: str, *, timeout_s: float, connect: Connect = socket.create_connection
+    host: str,
+    *,
+    timeout_s: float = STOP_PATIENCE_S,
+    connect: Connect = socket.create_connection,
 ) -> bool:
     """Ask the dashboard to stop the program; returns whether it says that it did."""
+    deadline = time.monotonic() + timeout_s
     try:
         with connect((host, DASHBOARD_PORT), timeout_s) as connection:
-            stream = _Lines(connection, time.monotonic() + timeout_s)
+            stream = _Lines(connection, deadline)
             stream.line()
             return stream.ask("stop").startswith("Stopped")
     except OSError:

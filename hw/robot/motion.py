@@ -36,9 +36,19 @@ from collections.abc import Callable
 import numpy as np
 
 from hw.robot.confirmation import Confirmation
+from hw.robot.identity import stop_program
 from hw.robot.limits import CALLER_S, between
 from hw.robot.motion_plan import MotionPlan
-from hw.robot.mover.messages import WATCHDOG, Setup, error_of, line_of, sample_of, told
+from hw.robot.mover.messages import (
+    DASHBOARD_STOP,
+    MAY_BE_PAUSED,
+    WATCHDOG,
+    Setup,
+    error_of,
+    line_of,
+    sample_of,
+    told,
+)
 from hw.robot.path_checks import check_plan
 from hw.robot.stream import PoseSample
 from hw.runtime.clock import HELD_UP_WALL_S, REAL, Clock
@@ -116,6 +126,10 @@ class Motion:
         self._told = math.inf
         """When the other process told something last; it does so all the time, also at rest."""
         self._in_motion = False
+        self._last_word = False
+        """Whether the other process has said that it ends."""
+        self._may_be_paused = ""
+        """What a person must do where that process could not end its program."""
 
     def start(self) -> Motion:
         """Connect; takes a second or two.
@@ -308,7 +322,7 @@ class Motion:
                 self._kill(error)
                 text = "; ".join(dict.fromkeys([error.args[0], silence.args[0]]))
                 text = text if WATCHDOG in text else f"{text}; {WATCHDOG}"
-                raise type(error)(text, device="robot")
+                raise type(error)(f"{text}{self._may_be_paused}", device="robot")
 
     def _ask_guard(self) -> StaleError | None:
         """Ask the guard; a danger is latched and sent, a hesitation is returned."""
@@ -413,7 +427,21 @@ class Motion:
             what, text = "error", "the motion process ended; the robot's own watchdog stops it"
             if self._process.wait() == -signal.SIGALRM:
                 what, text = "hung", f"{_NO_ANSWER}; {WATCHDOG}"
+            self._end_program()
+            text += self._may_be_paused
             self._answers.put({"what": what, "kind": "LostError", "text": text, "ended": True})
+
+    def _end_program(self) -> None:
+        """End the program of a process that ended without a word, as within a command (SIGALRM).
+
+        A person or a safety stop may have paused it meanwhile: then it would go on with the motion
+        when it is resumed, until its watchdog ends it.
+        """
+        if self._last_word or self.dry_run or self.serial is None:
+            return
+        self._note(self.clock.now(), DASHBOARD_STOP, {})
+        if not stop_program(self.host):
+            self._may_be_paused = f"; {MAY_BE_PAUSED}"
 
     def _note(self, t: float, command: str, values: dict[str, object]) -> None:
         try:
@@ -423,6 +451,7 @@ class Motion:
             self.stop(f"the log failed: {type(error).__name__}: {error}")
 
     def _hear(self, message: dict) -> None:
+        self._last_word |= message["what"] == "closed" or bool(message.get("ended"))
         match message["what"]:
             case "log":
                 self._note(message["t"], message["command"], message["numbers"])

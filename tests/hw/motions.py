@@ -71,6 +71,7 @@ def put_in_order(robot: EmulatedRobot) -> EmulatedRobot:
     robot.ask("freeze", False)
     robot.ask("heed stops", True)
     robot.ask("pause", False)
+    robot.ask("pause before", None)
     robot.ask("stamps", 1000.0, 1.0)
     robot.ask("overspeed", 1.0)
     robot.ask("dashboard", None)

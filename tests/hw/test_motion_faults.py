@@ -310,6 +310,40 @@ def test_a_program_that_a_person_pauses_is_ended(robots):
         assert robot.state()["raw"] == state["raw"]
 
 
+@pytest.mark.parametrize("dashboard", [None, ""], ids=["answers", "mute"])
+def test_a_program_that_is_paused_within_a_command_is_ended(robots, dashboard):
+    """Nobody told the dashboard: the process had died waiting, and the arm moved when resumed."""
+    robot = put_in_order(robots["CB"])
+    with moving(robot, caller_s=2.0) as motion:
+        robot.ask("pause before", 36)
+        robot.ask("mute control", True)
+        robot.ask("dashboard", dashboard)
+        with pytest.raises(LostError, match="answers are lost; the robot's own watchdog") as told:
+            motion.move_to(farther(robot))
+        assert ("stop it at the pendant before" in str(told.value)) == (dashboard is not None)
+        assert only_asked(robot.state())
+        if dashboard is None:
+            assert robot.state()["reason"] == "the dashboard stopped it"
+        with pytest.raises(RefusedError, match="confirm the plan again"):
+            motion.move_to(HOME)
+
+
+@pytest.mark.parametrize("command", [36, 3], ids=["isPoseWithinSafetyLimits", "moveL"])
+def test_a_command_that_a_paused_program_did_not_take_ends_motion(robots, command):
+    """The packet that tells of the pause was unread when the process ended."""
+    robot = put_in_order(robots["CB"])
+    with moving(robot, caller_s=2.0) as motion:
+        robot.ask("pause before", command)
+        with pytest.raises((StoppedError, RefusedError)) as told:
+            motion.move_to(farther(robot))
+        if command == 3:
+            assert "the program was paused on the robot" in str(told.value)
+        with pytest.raises((StoppedError, RefusedError), match=r"was paused.*confirm the plan"):
+            until_ended(motion)
+        assert robot.state()["reason"] == "the dashboard stopped it"
+        assert only_asked(robot.state())
+
+
 def test_of_two_that_connect_at_once_one_moves_the_robot(robots):
     robot = robots["e"]
     put_in_order(robot)

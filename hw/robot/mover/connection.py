@@ -13,7 +13,7 @@ from hw.robot.identity import LOCAL, read_identity, stop_program, until_local
 from hw.robot.limits import numbers
 from hw.robot.mover.controller import IDLE_WATCHDOG_HZ, STOP_PATIENCE_S, Controller, said
 from hw.robot.mover.inputs import Inputs
-from hw.robot.mover.messages import Setup
+from hw.robot.mover.messages import DASHBOARD_STOP, MAY_BE_PAUSED, Setup
 from hw.robot.mover.no_reconnect import NoReconnect
 from hw.robot.mover.program import guarded_program, send_program
 from hw.robot.path_checks import check_plan
@@ -27,8 +27,6 @@ _START_S = 30.0
 """Longest time for ur_rtde to connect."""
 _END_S = 5.0
 """Longest time for the end of the script and of the connection."""
-_DASHBOARD_S = 0.3
-"""Longest wait (wall s) for the dashboard; the caller waits for the end of this process."""
 _CONTROL_S = 0.2
 """The dashboard is asked so often (wall s) whether the robot is still in remote control."""
 
@@ -187,12 +185,10 @@ class Connection:
         packet = self._inputs.packet
         if not packet.program or not (packet.paused or safety_text(packet.safety_bits)):
             return ""
-        self._controller.log("dashboard: stop")
+        self._controller.log(DASHBOARD_STOP)
         assert self._no_reconnect is not None
         connect = self._no_reconnect.connect
-        if stop_program(self._setup.host, timeout_s=_DASHBOARD_S, connect=connect):
-            return ""
-        return "; the program may be paused: stop it at the pendant before you go on there"
+        return "" if stop_program(self._setup.host, connect=connect) else f"; {MAY_BE_PAUSED}"
 
 
 def _connection_among(descriptors: set[str]) -> socket.socket:

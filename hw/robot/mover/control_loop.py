@@ -166,10 +166,12 @@ class ControlLoop:
             offset = numbers(controller.command("getTCPOffset"), 6, "TCP offset")
             self._inputs.tcp_offset = offset
         raw = list(self._allow(pose, speed_mm_s).raw)
-        if not controller.command("isPoseWithinSafetyLimits", raw):
+        within = controller.command("isPoseWithinSafetyLimits", raw)
+        # A paused program says no, too.
+        self._heed()
+        if not within:
             text = "the controller says that the pose is outside its safety limits"
             raise refused(text)
-        self._heed()
         controller.watch_motion()
         # The questions took time: check again for a stop, and check the move from the newest pose.
         self._heed()

@@ -51,6 +51,7 @@ _UNHEARD_S = 0.5
 sending a lost packet again takes 0.2 s."""
 _LEAST_WAIT_S = 0.1
 """A command may wait for its answer at least so long (wall s)."""
+PAUSED = "the program was paused on the robot; then confirm the plan again"
 _CAUSE_S = 0.1
 """The poses tell of a safety stop by so much later than the controller's program ends."""
 
@@ -150,7 +151,7 @@ class Controller:
             Ended: the controller did not take it.
         """
         if not self.command("moveL", raw, speed_m_s, acceleration_m_s2, True):
-            raise Ended(lost("the controller did not take the motion"))
+            raise Ended(self.program_stopped("the controller did not take the motion"))
         self._kicked = self._clock.now()
 
     # The watchdog
@@ -244,7 +245,7 @@ class Controller:
         )
 
     def program_stopped(self, what: str = "the controller's program stopped") -> DeviceError:
-        """Why the controller takes no commands: a safety stop if one is told of, else ``what``.
+        """Why the controller takes no commands: a stop or pause if one is told, else ``what``.
 
         Raises:
             Ended: the connection is lost.
@@ -257,6 +258,8 @@ class Controller:
                 stopped = unfit(packet)
                 if stopped is not None:
                     return stopped
+        if inputs.packet.paused:
+            return StoppedError(PAUSED, device="robot")
         if inputs.program_ended and inputs.packet.program:
             text = "another program was started on the robot: stop it at the pendant"
             return StoppedError(f"{text}, then confirm the plan again", device="robot")

@@ -31,6 +31,10 @@ _KINDS = {kind.__name__: kind for kind in (LostError, RefusedError, StaleError, 
 
 WATCHDOG = "the robot's own watchdog stops it. Motion needs a new confirmation"
 """What follows where nobody can command the robot any more."""
+DASHBOARD_STOP = "dashboard: stop"
+"""What is logged before the dashboard is asked to stop the program."""
+MAY_BE_PAUSED = "the program may be paused: stop it at the pendant before you go on there"
+"""What follows where the dashboard did not say that it stopped the program."""
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import math
 
 from hw.robot.gate import Command
 from hw.robot.identity import LOCAL
-from hw.robot.mover.controller import Controller, unfit
+from hw.robot.mover.controller import PAUSED, Controller, unfit
 from hw.robot.mover.inputs import Inputs, Stop, lost
 from hw.robot.mover.messages import Setup
 from hw.robot.path_checks import out_of_box_mm
@@ -53,7 +53,7 @@ class Monitor:
             if stopped is not None:
                 return Stop(stopped, True)
         if any(packet.paused for packet in packets):
-            return _for_good("the program was paused on the robot; then confirm the plan again")
+            return _for_good(PAUSED)
         if self._controller.local:
             return _for_good(f"{LOCAL}; then confirm the plan again")
         if inputs.program_ended or not inputs.packet.status_bits & PROGRAM_RUNS:
