@@ -296,6 +296,23 @@ def test_a_motion_does_not_go_on_when_a_safeguard_stop_is_released(robots, dashb
             motion.move_to(HOME)
 
 
+def test_a_motion_that_goes_on_before_the_dashboard_answers_is_stopped(robots):
+    """No packets were read meanwhile, and the arm moved until its watchdog stopped it."""
+    robot = put_in_order(robots["e"])
+    with moving(robot, caller_s=2.0) as motion:
+
+        def fault() -> None:
+            robot.ask("dashboard", "")
+            robot.ask("robot_state", 7, 5)
+            time.sleep(0.05)
+            robot.ask("robot_state", 7, 1)
+
+        error, rest_s, _ = fault_in_motion(robot, motion, fault)
+        assert "safeguard stop: close the gate" in str(error)
+        assert rest_s <= 0.05 + STOP_WITHIN_S
+        assert robot.state()["log"][-1][1] == 33
+
+
 def test_a_program_that_a_person_pauses_is_ended(robots):
     """It was called a frozen pose, and the motion went on when the program was resumed."""
     robot = put_in_order(robots["CB"])

@@ -12,7 +12,7 @@ from hw.robot.gate import Gate
 from hw.robot.identity import LOCAL, read_identity, stop_program, until_local
 from hw.robot.limits import numbers
 from hw.robot.mover.controller import IDLE_WATCHDOG_HZ, STOP_PATIENCE_S, Controller, said
-from hw.robot.mover.inputs import Inputs
+from hw.robot.mover.inputs import Ended, Inputs
 from hw.robot.mover.messages import DASHBOARD_STOP, MAY_BE_PAUSED, Setup
 from hw.robot.mover.no_reconnect import NoReconnect
 from hw.robot.mover.program import guarded_program, send_program
@@ -175,7 +175,8 @@ class Connection:
     def end_paused(self) -> str:
         """End a program that a safety stop or a person has paused: it might be let go on.
 
-        A paused program reads no commands, so the dashboard is asked.
+        A paused program reads no commands, so the dashboard is asked. If the program is let go on
+        before the dashboard has ended it, the robot is stopped.
 
         Returns:
             What a person must do if it could not be ended.
@@ -187,8 +188,20 @@ class Connection:
             return ""
         self._controller.log(DASHBOARD_STOP)
         assert self._no_reconnect is not None
-        connect = self._no_reconnect.connect
-        return "" if stop_program(self._setup.host, connect=connect) else f"; {MAY_BE_PAUSED}"
+        connect, stopped = self._no_reconnect.connect, threading.Event()
+
+        def ask() -> None:
+            if stop_program(self._setup.host, connect=connect):
+                stopped.set()
+
+        asking = threading.Thread(target=ask, name="dashboard", daemon=True)
+        asking.start()
+        with suppress(Ended):
+            while asking.is_alive() and not self._controller.usable():
+                self._inputs.read(self._clock.wall(0.01))
+        self._controller.stop_unseen()
+        asking.join()
+        return "" if stopped.is_set() else f"; {MAY_BE_PAUSED}"
 
 
 def _connection_among(descriptors: set[str]) -> socket.socket:
