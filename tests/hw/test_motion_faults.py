@@ -195,11 +195,15 @@ def test_a_robot_that_is_faster_than_commanded_is_stopped(robots):
     assert abs(1000.0 * robot.state()["raw"][0] - target[0, 3]) > 1.0
 
 
-def test_a_robot_that_does_not_heed_a_stop_is_stopped_by_its_watchdog(robots):
-    """It was kept alive for two seconds by the process that told it to stop again and again."""
+@pytest.mark.parametrize("speed_mm_s", [15.0, 0.5])
+def test_a_robot_that_does_not_heed_a_stop_is_stopped_by_its_watchdog(robots, speed_mm_s):
+    """It was kept alive for two seconds by the process that told it to stop again and again.
+
+    Below 1 mm/s it counted as at rest.
+    """
     robot = put_in_order(robots["CB"])
     robot.ask("heed stops", False)
-    slow = replace(PLAN, limits=replace(PLAN.limits, max_speed_mm_s=15.0))
+    slow = replace(PLAN, limits=replace(PLAN.limits, max_speed_mm_s=speed_mm_s))
     with moving(robot, plan=slow, caller_s=2.0) as motion, ThreadPoolExecutor(1) as pool:
         stopping = pool.submit(motion.move_to, farther(robot))
         while not any(robot.state()["velocity"]) and not stopping.done():

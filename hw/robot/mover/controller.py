@@ -27,6 +27,7 @@ from hw.robot.mover.messages import Caller, Setup
 from hw.robot.rtde import PROGRAM_RUNS, Packet, safety_text, state_text
 from hw.runtime.errors import DeviceError, LostError, StoppedError
 from hw.runtime.processes import ASKS, be_prompt
+from hw.runtime.rigid import apart
 
 _WATCHDOG_HZ, IDLE_WATCHDOG_HZ = 10.0, 0.5
 """The controller stops its program, and the robot, when it hears nothing for 0.1 s during a motion;
@@ -35,8 +36,10 @@ _KICK_S = 0.02
 _STOP_M_S2 = 2.0
 _STOPPED_MM_S, _STOPPED_RAD_S = 1.0, 0.01
 """Below these speeds the TCP counts as at rest; a real arm's reading is never quite zero."""
-_REST_SEEN_S = 0.03
-"""A stop is done when the poses have shown rest for so long after stopL (4 poses at 125 Hz)."""
+_REST_SEEN_S, _STILL_MM = 0.1, 0.03
+"""A stop is done when the poses have shown rest for so long after stopL, and differ by no more than
+this (a degree counts as a mm; an assumption: more than a real arm's readings differ by): a motion
+may be slower than the speeds above."""
 _STOP_AGAIN_S = 0.05
 """stopL is sent again to a robot that still moves after this time."""
 _BRAKES_S = 0.5
@@ -198,8 +201,7 @@ class Controller:
             if self._rests():
                 return
             late_s = self._inputs.sample.measured_s - taken_s
-            unheeded = late_s > self._clock.patience(_BRAKES_S) and _moves(self._inputs.packet)
-            if unheeded or self._clock.now() > give_up:
+            if late_s > self._clock.patience(_BRAKES_S) or self._clock.now() > give_up:
                 text = "the robot was told to stop and still moves: press the emergency stop"
                 if self._inputs.packet.tcp_pose == before:
                     text = (
@@ -217,14 +219,16 @@ class Controller:
     def _rests(self) -> bool:
         """Whether the poses show rest for :data:`_REST_SEEN_S`; False: send stopL again."""
         sent = since = self._inputs.packet.timestamp_s
-        give_up = self._clock.now() + self._clock.patience(10 * _REST_SEEN_S)
+        place = self._inputs.sample.pose
+        give_up = self._clock.now() + self._clock.patience(3 * _REST_SEEN_S)
         while self._clock.now() < give_up:
             # A stop for good that comes now replaces a hesitation.
-            self._inputs.read(self._clock.wall(_REST_SEEN_S / 4))
+            self._inputs.read(self._clock.wall(_REST_SEEN_S / 12))
             self.kick()
             packet = self._inputs.packet
-            if packet.timestamp_s > since and _moves(packet):
-                since = packet.timestamp_s
+            pose = self._inputs.sample.pose
+            if packet.timestamp_s > since and (_moves(packet) or apart(pose, place) > _STILL_MM):
+                since, place = packet.timestamp_s, pose
                 if since - sent > _STOP_AGAIN_S:
                     return False
             if packet.timestamp_s - since >= _REST_SEEN_S:
