@@ -23,6 +23,7 @@ import numpy as np
 
 from hw.active_echo.device import SILENT, ActiveEcho, EchoFrame, EchoStatistics, median_of
 from hw.recording.recorder import Recorder
+from hw.robot.limits import between
 from hw.robot.stream import PoseSample, PoseStream
 from hw.runtime.clock import Waiting
 from hw.runtime.errors import DeviceError, StaleError
@@ -56,6 +57,17 @@ _BAD_FRAMES = {
     "short": "came with lines missing (missed line triggers)",
 }
 """:class:`hw.active_echo.device.EchoStatistics` that tell of damaged frames, in words."""
+_MOST = {
+    "echo_age_s": 10.0,
+    "echo_late_s": 10.0,
+    "image_age_s": 10.0,
+    "pose_age_s": 0.1,
+    "burst": 100.0,
+    "burst_s": 10.0,
+    "grace_s": 60.0,
+    "clear_s": 10.0,
+}
+"""Bounds of :class:`SilenceLimits`."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +83,9 @@ class SilenceLimits:
         burst_s: see ``burst``.
         grace_s: how long a hesitation may last before the acquisition gives up.
         clear_s: how long the trouble must have been gone before the robot moves again.
+
+    Raises:
+        RefusedError: a limit that does not limit anything.
     """
 
     echo_age_s: float = 0.12
@@ -81,6 +96,10 @@ class SilenceLimits:
     burst_s: float = 0.5
     grace_s: float = 3.0
     clear_s: float = 0.3
+
+    def __post_init__(self) -> None:
+        for name, most in _MOST.items():
+            between(name, float(getattr(self, name)), 0.0, most)
 
 
 class Session:

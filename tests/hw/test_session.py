@@ -11,7 +11,7 @@ import tempfile
 import threading
 import time
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import h5py
@@ -43,6 +43,14 @@ pytest.importorskip("serial", reason="needs jaxcal[serial]")
 
 def silence(_t: float, _threshold: int) -> tuple[np.ndarray, np.ndarray]:
     return np.full(8, 50e-6), np.full(8, 900.0)
+
+
+@pytest.mark.parametrize("name", [item.name for item in fields(SilenceLimits)])
+def test_a_limit_on_silence_that_limits_nothing_is_refused(name):
+    """With NaN nothing was ever too old."""
+    for value in (0, 1000) if name == "burst" else (np.nan, np.inf, 0.0, 1000.0):
+        with pytest.raises(RefusedError, match=f"{name} must be above 0"):
+            SilenceLimits(**{name: value})
 
 
 @pytest.mark.parametrize(("rate_hz", "missed"), [(12.0, 0.0), (50.0, 0.3)])
