@@ -50,8 +50,8 @@ _SHORTEST_WAIT_S = 0.25
 
 _LARGEST_GAP = 2**31
 _REMEMBERED = 256
-_ANCHOR_S = 60.0
-"""A measured delay is used for this long, in which two quartz clocks drift apart by 6 ms."""
+_DRIFT = 1e-4
+"""Two quartz clocks drift apart by less than this."""
 
 _MAXIMUM_DELAY_TICKS = 0xFFFF
 
@@ -434,13 +434,11 @@ class ActiveEcho:
         )
 
     def _late(self, packet: EchoPacket, now: float) -> float:
-        """Upper bound of a frame's delay, s; NaN where it was not measured lately."""
+        """Upper bound of a frame's delay, s; NaN where none was measured."""
         late = float("nan")
         if self._anchor is not None:
             arrived, ticks, before = self._anchor
-            late = before + (now - arrived) - (packet.ticks - ticks) * self._tick_s
-            if now - arrived > _ANCHOR_S:
-                late, self._anchor = float("nan"), None
+            late = before + (1 + _DRIFT) * (now - arrived) - (packet.ticks - ticks) * self._tick_s
         if self._asked is not None:
             sent, frame = self._asked
             if (packet.frame - frame) % 2**32 < _LARGEST_GAP:

@@ -498,6 +498,16 @@ def test_a_device_that_takes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
         os.close(slave)
 
 
+def test_how_late_frames_are_is_known_for_minutes() -> None:
+    """After 60 s nothing counted as late any more, as within one slow motion."""
+    device = object.__new__(ActiveEcho)
+    device._asked, device._anchor, device._tick_s = None, (0.0, 0, 0.01), 1e-8
+    silent = np.full(LINES, 0xFFFF, np.uint16)
+    for now in (50.0, 70.0, 300.0):
+        packet = EchoPacket(1, round((now - 2.0) / 1e-8), 0, silent, silent)
+        assert 2.01 <= device._late(packet, now) <= 2.01 + 1e-3 + 1e-4 * now
+
+
 def test_fuzz_through_the_driver() -> None:
     """Damaged frames over a real pty: the driver hands on only what was sent, and goes on."""
     rng = np.random.default_rng(4)
