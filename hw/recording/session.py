@@ -281,11 +281,12 @@ class Session:
                     device="active echo",
                 )
             if self._is_late():
-                return StaleError(
-                    f"echo frames are {self._echo_frames[-1].late_s:.1f} s late: check the link to "
-                    "the device, e.g. a bridge from serial line to network",
-                    device="active echo",
-                )
+                late = self._echo_frames[-1].late_s
+                text = f"echo frames are {late:.1f} s late: check the link to the device, e.g. a "
+                text += "bridge from serial line to network"
+                if math.isnan(late):
+                    text = "nothing tells how late echo frames are: was the device restarted?"
+                return StaleError(text, device="active echo")
             if self.images is not None and now - self._image_seen > self.clock.patience(
                 watch.image_age_s
             ):
@@ -307,7 +308,7 @@ class Session:
     def _is_late(self) -> bool:
         """Whether the newest echo frame may have come too late."""
         late = self._echo_frames[-1].late_s if self._echo_frames else 0.0
-        return late > self.clock.patience(self.watch.echo_late_s)
+        return not late <= self.clock.patience(self.watch.echo_late_s)
 
     # Data
 

@@ -113,6 +113,11 @@ def test_a_question_that_was_held_up_does_not_end_the_run(tmp_path):
             time.sleep(0.3)
             assert "late: check the link" in str(session.trouble())
             session.wait_until_clear()
+            # Of a device that has restarted, no frame was late any more.
+            emulator.restart_counter()
+            time.sleep(0.2)
+            assert "nothing tells how late echo frames are" in str(session.trouble())
+            session.wait_until_clear()
 
 
 def test_an_image_that_a_slow_link_holds_up_is_not_of_the_next_pose(tmp_path):
