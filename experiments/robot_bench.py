@@ -5,7 +5,8 @@ through ur_rtde. Three tables:
 
 - ``robot_faults.csv``: for every fault during a motion at 50 mm/s, how long (ms) until the arm
   rests and until the caller knows, by the emulator's own clock. The limit is 200 ms; for answers of
-  the controller that are lost it is 500 ms more, since a lost packet is sent again.
+  the controller that are lost it is 500 ms more, since a lost packet is sent again. A stop that the
+  controller takes but does not heed is waited for as long, and then the watchdog (100 ms) acts.
 - ``robot_rates.csv``: poses lost at 125 and 500 Hz, both robots at once.
 - ``robot_speeds.csv``: how much faster than real time the bench may run before the freshness limit
   (100 ms of bench time), the controller's watchdog (100 ms) or the caller's limit stop motions.
@@ -60,8 +61,9 @@ LIMITS = Limits(
 FAULTS = (
     "mute", "lost answers", "drop", "drop control", "protective_stop", "force", "tcp_offset",
     "guard", "stop", "end the mover", "kill the mover", "silent caller",
+    "unheeded stop",
 )  # fmt: skip
-LIMIT_MS = dict.fromkeys(FAULTS, 200.0) | {"lost answers": 700.0}
+LIMIT_MS = dict.fromkeys(FAULTS, 200.0) | {"lost answers": 700.0, "unheeded stop": 800.0}
 
 
 def beside(x: float, y: float = 0.0, z: float = 0.0) -> np.ndarray:
@@ -112,6 +114,7 @@ def fault(name: str) -> tuple[float, float, str]:
             "guard": lambda: reasons.__setitem__(0, "the echo was lost"),
             "silent caller": lambda: reasons.__setitem__(0, "silent"),
             "stop": lambda: motion.stop("the operator pressed stop"),
+            "unheeded stop": lambda: (robot.ask("heed stops", False), motion.stop("danger")),
             "lost answers": lambda: robot.ask("mute control", True),
             "end the mover": lambda: os.kill(mover, signal.SIGTERM),
             "kill the mover": lambda: os.kill(mover, signal.SIGKILL),

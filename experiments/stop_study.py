@@ -2,14 +2,16 @@
 
 Each trial is a process of its own that confirms a plan, connects by the real ur_rtde to an emulated
 controller at real time, and asks for a move of 40 to 80 mm at 100 mm/s. The stop comes at a random
-moment from 50 ms before to 200 ms after that request, in one of five ways:
+moment from 50 ms before to 200 ms after that request, in one of seven ways:
 
 - ``guard``: from that moment on the guard reports danger;
 - ``stop``: another thread calls ``Motion.stop``;
 - ``interrupt``: the process gets SIGINT (Ctrl-C);
 - ``pipe``: the pipe to the mover closes;
 - ``kill``: the process gets SIGKILL, so that the operating system closes that pipe, when it gets to
-  it: on a busy machine the end of a process takes long.
+  it: on a busy machine the end of a process takes long;
+- ``pause``: the controller's program is paused, and resumed 0.3 s later, when it must be over;
+- ``unreadable``: the controller's packets hold NaN from that moment on.
 
 Times and places are the emulated controller's. A stop counts as lost if the arm comes to rest later
 than 200 ms after it, or travels more than 15 mm after it, or if the answer was "arrived", or if the
@@ -55,7 +57,8 @@ from jaxcal.runtime.isolated import import_path
 
 SEED = 16
 SERIES = {"CB": CB_SERIES, "e": E_SERIES}
-WAYS = ("guard", "stop", "interrupt", "pipe", "kill")
+WAYS = ("guard", "stop", "interrupt", "pipe", "kill", "pause", "unreadable")
+_RESUMED_S = 0.3
 EARLIEST_S, LATEST_S = -0.05, 0.2
 """When a stop may come, counted from the request to move."""
 REST_WITHIN_S, TRAVEL_WITHIN_MM = 0.2, 15.0
@@ -181,15 +184,26 @@ class Bench:
                 assert caller.stderr is not None
                 raise NotBegunError(f"the caller ended: {caller.stderr.read()[-1000:]}")
             stop_s = first["request_s"] + delay_s
-            if way in ("interrupt", "kill"):
+            if way in ("interrupt", "kill", "pause", "unreadable"):
                 time.sleep(max(0.0, clock.wall(stop_s - clock.now())))
                 stop_s = clock.now()
-                caller.send_signal(signal.SIGINT if way == "interrupt" else signal.SIGKILL)
+            match way:
+                case "interrupt":
+                    caller.send_signal(signal.SIGINT)
+                case "kill":
+                    caller.send_signal(signal.SIGKILL)
+                case "pause":
+                    robot.ask("pause", True)
+                    clock.sleep(_RESUMED_S)
+                    robot.ask("pause", False)
+                case "unreadable":
+                    robot.ask("force", [math.nan] * 6)
             line = "" if way == "kill" else told.get(timeout=_PATIENCE_S)
             answer = json.loads(line or "{}")
         finally:
             caller.kill()
             caller.wait()
+            robot.ask("force", [0.0] * 6)
             reader.join()
             for stream in (caller.stdout, caller.stderr):
                 assert stream is not None
