@@ -11,7 +11,7 @@ from functools import cached_property
 from hw.robot.limits import between
 from hw.robot.motion_plan import MotionPlan
 from hw.robot.path_checks import check_plan
-from hw.runtime.clock import Clock
+from hw.runtime.clock import Clock, asleep_s
 from hw.runtime.errors import refused
 
 _VALID_S = 600.0
@@ -27,6 +27,7 @@ class Confirmation:
         serial: of the robot.
         issued_s: bench time.
         expires_s: bench time by which the connection must be made; later motions are not limited.
+        asleep_s: reading of :func:`hw.runtime.clock.asleep_s` when it was issued.
         unattended: whether it was given without asking a person.
         used: set when motion is started with it; every start needs a new confirmation.
     """
@@ -35,6 +36,7 @@ class Confirmation:
     serial: str
     issued_s: float
     expires_s: float
+    asleep_s: float
     unattended: bool = False
     used: threading.Event = field(default_factory=threading.Event, compare=False, repr=False)
 
@@ -122,4 +124,4 @@ def _confirmation(
 ) -> Confirmation:
     between("valid_s", valid_s, 0.0, 24 * 3600.0)
     now = clock.now()
-    return Confirmation(plan.digest, plan.serial, now, now + valid_s, unattended)
+    return Confirmation(plan.digest, plan.serial, now, now + valid_s, asleep_s(), unattended)

@@ -22,7 +22,7 @@ from hw.robot.motion_plan import MotionPlan
 from hw.robot.path_checks import check_path, checked_pose, pace, within_search
 from hw.robot.rtde import PendantSettings, state_text
 from hw.robot.stream import PoseSample, offset_changed
-from hw.runtime.clock import Clock
+from hw.runtime.clock import Clock, asleep_s
 from hw.runtime.errors import StaleError, refused
 from hw.runtime.rigid import pose_to_ur
 
@@ -76,6 +76,9 @@ class Gate:
         """
         self.check_authority(serial, tcp_offset, pendant)
         given, now = self.confirmation, self.clock.now()
+        if given is not None:
+            # A computer that slept counts no time meanwhile, but people come and go.
+            now += (asleep_s() - given.asleep_s) * self.clock.speed
         if given is None or not given.issued_s <= now < given.expires_s:
             raise refused("the confirmation has expired; confirm the plan again")
 

@@ -31,6 +31,19 @@ def monotonic_s() -> float:
 _RAW = getattr(time, "CLOCK_MONOTONIC_RAW", None)
 
 
+def asleep_s() -> float:
+    """For how long this computer has slept since it was started, s; 0 where it does not tell.
+
+    While it sleeps, :func:`monotonic_s` stands still.
+    """
+    if _BOOT is None:
+        return 0.0
+    return time.clock_gettime(_BOOT) - time.clock_gettime(time.CLOCK_MONOTONIC)
+
+
+_BOOT = getattr(time, "CLOCK_BOOTTIME", None)
+
+
 @dataclass(frozen=True)
 class Clock:
     """A monotonic clock that starts at zero.

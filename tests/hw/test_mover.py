@@ -122,7 +122,7 @@ def test_a_stop_by_a_signal_is_kept_at_whatever_moment_it_comes(step):
 
 
 def test_a_setup_and_a_pose_arrive_as_they_were_sent():
-    given = Confirmation(PLAN.digest, PLAN.serial, 1.0, 2.0)
+    given = Confirmation(PLAN.digest, PLAN.serial, 1.0, 2.0, 3.0)
     sent = Setup("127.0.0.1", PLAN, given, CLOCK, False, 0.15)
     came = Setup.of(json.loads(line_of(sent.message())))
     assert came.plan.digest == PLAN.digest

@@ -19,7 +19,7 @@ from hw.robot.motion_plan import MotionPlan, array_of
 from hw.robot.path_checks import check_plan
 from hw.robot.rtde import PendantSettings
 from hw.robot.stream import PoseSample
-from hw.runtime.clock import Clock
+from hw.runtime.clock import Clock, asleep_s
 from hw.runtime.errors import RefusedError, StaleError
 from hw.runtime.rigid import pose_to_ur, ur_to_pose
 
@@ -70,7 +70,7 @@ def plan_of(poses: list[np.ndarray], limits: Limits = LIMITS) -> MotionPlan:
 
 def gate(plan: MotionPlan = PLAN) -> Gate:
     now = CLOCK.now()
-    return Gate(plan, Confirmation(plan.digest, plan.serial, now, now + 1000.0), CLOCK)
+    return Gate(plan, Confirmation(plan.digest, plan.serial, now, now + 1000.0, asleep_s()), CLOCK)
 
 
 def move(
@@ -376,7 +376,12 @@ def test_a_slow_speed_slider_gives_a_motion_more_time():
 
 def test_a_confirmation_that_expires_ends_no_plan_that_was_begun():
     mine = confirmed()
-    for late in (replace(mine, expires_s=CLOCK.now()), replace(mine, issued_s=1e9)):
+    for late in (
+        replace(mine, expires_s=CLOCK.now()),
+        replace(mine, issued_s=1e9),
+        # The computer has slept since.
+        replace(mine, asleep_s=mine.asleep_s - 700.0),
+    ):
         gate_of_late = Gate(PLAN, late, CLOCK)
         with pytest.raises(RefusedError, match="expired"):
             gate_of_late.check_start(SERIAL, OFFSET, PENDANT)

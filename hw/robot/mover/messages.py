@@ -79,6 +79,7 @@ class Setup:
                 "serial": given.serial,
                 "issued_s": given.issued_s,
                 "expires_s": given.expires_s,
+                "asleep_s": given.asleep_s,
             },
         }
 
