@@ -51,10 +51,6 @@ class Bracket:
         """Whether an elevational offset lies inside."""
         return bool(self.low_mm <= elevation_mm <= self.high_mm)
 
-    def agrees(self, other: Bracket) -> bool:
-        """Whether both may be true, that is, whether the intervals overlap."""
-        return bool(self.low_mm <= other.high_mm and other.low_mm <= self.high_mm)
-
 
 @dataclass(frozen=True)
 class Placement:

@@ -34,8 +34,6 @@ _LEAST_SPEED_MM_S = 0.01
 class Command:
     """A motion that the gate allowed, in the controller's units."""
 
-    index: int
-    """Of the planned pose that it belongs to."""
     raw: tuple[float, ...]
     """Target: m and rotation vector (rad)."""
     pose: np.ndarray
@@ -180,7 +178,6 @@ class Gate:
         self._check_arm(start, goal, sample, length / velocity)
         acceleration = limits.max_acceleration_mm_s2 / 1000.0
         return Command(
-            near[0],
             tuple(float(v) for v in pose_to_ur(goal)),
             goal,
             speed,

@@ -317,8 +317,6 @@ def test_brackets_and_settings_check_themselves():
     settings = Settings(response_sd_mm=0.3, position_sd_mm=0.0, factor=2.0)
     wide = settings.bracket(0.1, 0.1, 0.05)
     assert wide.low_mm == pytest.approx(0.1 - np.hypot(0.1, 0.6))
-    assert wide.agrees(Bracket(0.5, 0.4, 0.6, 0.1))
-    assert not wide.agrees(Bracket(5.0, 4.0, 6.0, 0.1))
     with pytest.raises(InputError, match="fine_mm"):
         Settings(fine_mm=0.0)
     with pytest.raises(InputError, match="top_fraction"):

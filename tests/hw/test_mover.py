@@ -221,7 +221,7 @@ def test_a_move_that_is_refused_at_the_last_moment_leaves_the_watchdog_at_rest(m
     gate, inputs, controller, caller, connection = (
         Mock(spec=kind) for kind in (Gate, Inputs, Controller, Caller, Connection)
     )
-    allowed = Command(0, (0.0,) * 6, np.eye(4), 1.0, 1e-3, 0.1, 1.0)
+    allowed = Command((0.0,) * 6, np.eye(4), 1.0, 1e-3, 0.1, 1.0)
     gate.check_move.side_effect = [allowed, StaleError("too old", device="robot")]
     controller.serial, caller.left = PLAN.serial, False
     inputs.latch, inputs.tcp_offset, inputs.pendant = StopLatch(), None, None
