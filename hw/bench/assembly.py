@@ -21,12 +21,13 @@ from hw.bench.rtde import CB_SERIES, E_SERIES
 from hw.bench.ultrasound import ImageServer
 from hw.bench.world import World, make_world
 from hw.planning.scene import Scene
+from hw.robot.rtde import nominal_hz
 from hw.runtime.clock import Clock
 from hw.runtime.rigid import looking_rotation, pose_to_ur, ur_to_pose
 from jaxcal import InputError
 from jaxcal.runtime.array_types import Float
 
-VERSIONS = {125: CB_SERIES, 500: E_SERIES}
+VERSIONS = {int(nominal_hz(version[0])): version for version in (CB_SERIES, E_SERIES)}
 """Controllers that the real client accepts, by their rate: a CB-series and an e-Series."""
 
 _OF_THE_ROBOT: dict[str, tuple[str, ...]] = {

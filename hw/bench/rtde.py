@@ -47,7 +47,6 @@ from hw.robot.rtde import PORT, SCRIPT_PORT, nominal_hz
 from hw.runtime.clock import REAL, Clock
 from hw.runtime.processes import ANSWERS, be_prompt
 
-DASHBOARD, PRIMARY, SCRIPT, RTDE = DASHBOARD_PORT, PRIMARY_PORT, SCRIPT_PORT, PORT
 E_SERIES, CB_SERIES = (5, 11, 0, 108249), (3, 15, 8, 106339)
 """Controller versions of the two series of robots."""
 _MAX_WAITING = 1 << 16
@@ -133,7 +132,7 @@ class RtdeServer:
             OSError: an address is taken.
         """
         try:
-            for port in (DASHBOARD, PRIMARY, SCRIPT, RTDE):
+            for port in (DASHBOARD_PORT, PRIMARY_PORT, SCRIPT_PORT, PORT):
                 listener = socket.create_server((self.host, port))
                 listener.setblocking(False)
                 self._listeners.append(listener)
@@ -329,9 +328,9 @@ class RtdeServer:
             self._connections.add(connection)
             if not self._muted:
                 self._selector.register(sock, selectors.EVENT_READ, connection)
-            if data == DASHBOARD:
+            if data == DASHBOARD_PORT:
                 connection.waiting += b"Connected: Universal Robots Dashboard Server\n"
-            elif data == PRIMARY and self.version[:2] >= (3, 6):
+            elif data == PRIMARY_PORT and self.version[:2] >= (3, 6):
                 connection.waiting += self._kinematics()
         else:
             self._read(data)
@@ -350,11 +349,11 @@ class RtdeServer:
         if len(connection.received) > _MAX_INPUT:
             self._forget(connection)
             return
-        if connection.port == RTDE:
+        if connection.port == PORT:
             self._messages(connection)
-        elif connection.port == SCRIPT:
+        elif connection.port == SCRIPT_PORT:
             self._script(connection)
-        elif connection.port == PRIMARY:
+        elif connection.port == PRIMARY_PORT:
             # A real controller would run scripts sent here; this one closes the connection.
             self._forget(connection)
         else:
@@ -571,7 +570,7 @@ class RtdeServer:
         body = struct.pack(">QbB", max(stamp, 0), -2, 0) + f"program stopped: {reason}".encode()
         message = struct.pack(">IB", 5 + len(body), _ROBOT_MESSAGE) + body
         for connection in list(self._connections):
-            if connection.port == PRIMARY and len(connection.waiting) < _MAX_WAITING:
+            if connection.port == PRIMARY_PORT and len(connection.waiting) < _MAX_WAITING:
                 connection.waiting += message
 
     # Scripts and dashboard

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from hw.cli.common import POSE_HZ, controller_option, speed_option
+from hw.cli.common import controller_option, pose_hz_of, speed_option
 from jaxcal.cli.common import ExitCode
 
 
@@ -22,6 +22,6 @@ def bench(speed: float | None, controller: str | None, seed: int) -> int:
     """Serve an emulated bench until Ctrl-C; prints one JSON line with its addresses."""
     from hw.bench.run import BenchOptions, serve
 
-    pose_hz = POSE_HZ[controller or "cb"]
+    pose_hz = pose_hz_of(controller)
     serve(BenchOptions(speed=1.0 if speed is None else speed, seed=seed, pose_hz=pose_hz))
     return ExitCode.CONVERGED

@@ -18,9 +18,6 @@ if TYPE_CHECKING:
     from hw.bench.run import Bench
     from hw.setup.description import Setup
 
-POSE_HZ: dict[str, int] = dict(zip(CONTROLLERS, (125, 500), strict=True))
-"""Poses a second of a controller's series."""
-
 bench_option = click.option("--bench", is_flag=True, help="The emulated bench: no hardware at all.")
 setup_option = click.option(
     "--setup", "setup_path", type=click.Path(), metavar="TOML", help="The bench's description."
@@ -91,8 +88,16 @@ def started(
 
     speed = SPEED if speed is None else speed
     return stack.enter_context(
-        start(seed or 0, speed, POSE_HZ[controller or CONTROLLERS[0]], phantom or PHANTOMS[0])
+        start(seed or 0, speed, pose_hz_of(controller), phantom or PHANTOMS[0])
     )
+
+
+def pose_hz_of(controller: str | None) -> int:
+    """Poses a second of the emulated robot of a series; None: of the default."""
+    from hw.bench.assembly import VERSIONS
+
+    rates: dict[str, int] = dict(zip(CONTROLLERS, VERSIONS, strict=True))
+    return rates[controller or CONTROLLERS[0]]
 
 
 def setup_of(path: str | None, emulated: Bench | None) -> Setup:
