@@ -14,6 +14,8 @@ WAYS = {
     "interrupt": "Ctrl-C",
     "pipe": "the pipe closes",
     "kill": "the caller is killed",
+    "pause": "the program is paused",
+    "unreadable": "packets of NaN",
 }
 
 
@@ -37,7 +39,9 @@ claim(
 claim(SAFETY, "acquisition's process was silent for {:g} s | hesitation", lambda: [CALLER_S])
 claim(SAFETY, "after {:g} s without a sign of life", lambda: [CALLER_S])
 
-_PROMPT = [row for row in table("robot_faults") if row["fault"] != "lost answers"]
+_PROMPT = [
+    row for row in table("robot_faults") if row["fault"] not in ("lost answers", "unheeded stop")
+]
 claim(
     SAFETY,
     "After {:.0f} faults the robot was at rest within {:.0f} ms",
