@@ -115,7 +115,7 @@ def test_errors_that_no_tip_in_a_dimple_has_are_told(tmp_path, capsys):
     assert found.warnings[0] == found.wrong_frames
     told = str(found)
     assert told.count(found.wrong_frames) == 1
-    assert told.index("do not use: ") < told.index("tip in the tool's frame")
+    assert told.startswith("do not use: ")
     path = tmp_path / "poses.txt"
     np.savetxt(path, poses.reshape(POSES, 16))
     assert main(["pivot", str(path), "--json"]) == 3

@@ -44,10 +44,9 @@ def pivot_lines(record: dict[str, Any]) -> list[str]:
     def three(name: str) -> str:
         return ", ".join("-" if value is None else f"{value:.3f}" for value in record[name])
 
-    lines = [f"{record['status']}: {record['poses_used']} of {record['poses']} poses used"]
     wrong = record["wrong_frames"]
-    if wrong:
-        lines.append(f"do not use: {wrong}")
+    lines = [f"do not use: {wrong}"] if wrong else []
+    lines.append(f"{record['status']}: {record['poses_used']} of {record['poses']} poses used")
     if record["status"] != "failed":
         lines.append(f"tip in the tool's frame (mm): {three('tip_mm')}")
         lines.append(f"pivot point in the tracker's frame (mm): {three('point_mm')}")
