@@ -226,9 +226,9 @@ def bootstrapped(poses: np.ndarray) -> np.ndarray:
 
 def pivots(folder: Path) -> tuple[list[list[object]], list[str]]:
     """The same for the pivot recordings."""
-    undisturbed = read_poses(folder / "pivotCalibrationData.txt")
+    undisturbed = read_poses(folder / "pivotCalibrationData.txt", quaternion="xyzw")
     clean = jaxcal.calibrate_pivot(undisturbed)
-    poses = read_poses(folder / "pivotCalibrationDataWithOutliers.txt")
+    poses = read_poses(folder / "pivotCalibrationDataWithOutliers.txt", quaternion="xyzw")
     plain = jaxcal.calibrate_pivot(poses, robust=False)
     robust = jaxcal.calibrate_pivot(poses)
     apart = float(np.linalg.norm(np.asarray(robust.tip) - np.asarray(clean.tip)))

@@ -243,7 +243,7 @@ def test_bad_input_is_named():
 
 def test_too_few_poses_are_told_with_their_file(tmp_path, capsys):
     (tmp_path / "poses.txt").write_text("1 2 3 0 0 0 1\n")
-    assert main(["pivot", str(tmp_path / "poses.txt")]) == 2
+    assert main(["pivot", str(tmp_path / "poses.txt"), "--quaternion", "xyzw"]) == 2
     assert "poses.txt: 1 used poses are too few" in capsys.readouterr().err
 
 
@@ -251,24 +251,34 @@ def test_reading_poses(tmp_path):
     rotations = random_rotations(5)
     poses = swung(rotations)
     quaternions = np.hstack([poses[:, :3, 3], rotations.as_quat()])
-    for rows in (quaternions, poses.reshape(5, 16), poses[:, :3].reshape(5, 12)):
-        np.savetxt(tmp_path / "poses.txt", rows)
-        np.testing.assert_allclose(read_poses(tmp_path / "poses.txt"), poses, atol=1e-12)
+    file = tmp_path / "poses.txt"
+    for rows in (poses.reshape(5, 16), poses[:, :3].reshape(5, 12)):
+        np.savetxt(file, rows)
+        np.testing.assert_allclose(read_poses(file), poses, atol=1e-12)
+    with pytest.raises(jaxcal.FormatError, match="its poses are matrices: leave --quaternion out"):
+        read_poses(file, quaternion="xyzw")
     for stacked in (poses, poses[:, :3]):
-        np.savetxt(tmp_path / "poses.txt", stacked.reshape(-1, 4))
-        np.testing.assert_allclose(read_poses(tmp_path / "poses.txt"), poses, atol=1e-12)
+        np.savetxt(file, stacked.reshape(-1, 4))
+        np.testing.assert_allclose(read_poses(file), poses, atol=1e-12)
+    np.savetxt(file, quaternions)
+    np.testing.assert_allclose(read_poses(file, quaternion="xyzw"), poses, atol=1e-12)
+    with pytest.raises(jaxcal.FormatError, match=r"poses.txt:1: 7 columns hold a quaternion: say"):
+        read_poses(file)
     quaternions[3, 3:] *= 2
-    np.savetxt(tmp_path / "poses.txt", quaternions)
+    np.savetxt(file, quaternions)
     with pytest.raises(jaxcal.FormatError, match=r"poses.txt: quaternion in line 4 has length 2"):
-        read_poses(tmp_path / "poses.txt")
+        read_poses(file, quaternion="xyzw")
 
 
 def test_real_recording_with_outliers_reaches_the_clean_ones_precision(real_data, capsys):
     folder = real_data / "crosswire"
-    clean = jaxcal.calibrate_pivot(read_poses(folder / "pivotCalibrationData.txt"))
+    clean = jaxcal.calibrate_pivot(
+        read_poses(folder / "pivotCalibrationData.txt", quaternion="xyzw")
+    )
     assert float(clean.rms) == pytest.approx(0.511, abs=0.001)
     assert not np.asarray(clean.outlier).any()
-    assert main(["pivot", str(folder / "pivotCalibrationDataWithOutliers.txt"), "--json"]) == 0
+    disturbed = folder / "pivotCalibrationDataWithOutliers.txt"
+    assert main(["pivot", str(disturbed), "--quaternion", "xyzw", "--json"]) == 0
     record = json.loads(capsys.readouterr().out)
     # The last 144 of its 480 poses are wrong.
     assert record["outliers"] == list(range(336, 480))
@@ -278,9 +288,7 @@ def test_real_recording_with_outliers_reaches_the_clean_ones_precision(real_data
     both = np.array(record["covariance"])[:3, :3] + np.asarray(clean.covariance)[:3, :3]
     # A chi-square with 3 degrees of freedom is below 7.81 in 95 of 100.
     assert apart @ np.linalg.solve(both, apart) < 7.81
-    plain = jaxcal.calibrate_pivot(
-        read_poses(folder / "pivotCalibrationDataWithOutliers.txt"), robust=False
-    )
+    plain = jaxcal.calibrate_pivot(read_poses(disturbed, quaternion="xyzw"), robust=False)
     assert float(plain.rms) == pytest.approx(33.6, abs=0.1)
 
 

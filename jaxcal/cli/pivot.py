@@ -40,10 +40,11 @@ def pivot(poses: str, no_robust: bool, as_json: bool, **options: Any) -> int:
     """Find the tip of a tracked tool that was turned about its tip.
 
     POSES is a sequence of PLUS or Slicer, an export of NDI ToolBox or Motive, a table (CSV) with a
-    header, or a text file of poses, tool -> tracker, mm: for each a row x y z qx qy qz qw or the
-    matrix row by row (12 or 16 numbers), or three rows of four numbers. Poses that do not fit the
-    rest are left out and named; they are counted from 0, without those that were not tracked. The
-    status is 5 if the SD of the tip exceeds 1 mm along some direction.
+    header, or a text file of poses, tool -> tracker, mm: for each a row of x, y, z and a quaternion
+    (--quaternion says its order), the matrix row by row (12 or 16 numbers), or three rows of four
+    numbers. Poses that do not fit the rest are left out and named; they are counted from 0, without
+    those that were not tracked. The status is 5 if the SD of the tip exceeds 1 mm along some
+    direction.
     """
     import_engine()
     from jaxcal.calibration.pivot import calibrate_pivot

@@ -257,7 +257,7 @@ def read_crosswire(
 def read_poses(
     path: str | os.PathLike[str],
     *,
-    quaternion: QuaternionOrder = "xyzw",
+    quaternion: QuaternionOrder | None = None,
     pose_units: LengthUnit = "mm",
     invert_poses: bool = False,
 ) -> Float[np.ndarray, "n 4 4"]:
@@ -266,7 +266,7 @@ def read_poses(
     Args:
         path: a row for each pose, of 7 numbers, ``x y z`` and a unit quaternion, or of 12 or 16,
             the matrix row by row; or 3 or 4 rows of 4 numbers, as in :func:`read_crosswire`.
-        quaternion: where the scalar stands.
+        quaternion: where the scalar stands; needed for rows of 7 numbers, and refused for others.
         pose_units: of translations in the file.
         invert_poses: return the inverses of the file's poses.
 
@@ -275,19 +275,23 @@ def read_poses(
 
     Raises:
         FormatError: a file that cannot be read, a row of another length, something that is not a
-            number, a quaternion whose length is not 1, or what is to be inverted and is no pose;
-            the file and the line are named.
+            number, a quaternion whose order is not stated or whose length is not 1, or what is to
+            be inverted and is no pose; the file and the line are named.
     """
     table = _plain_table(path)
-    columns = "x y z qx qy qz qw, a matrix row by row, or 3 rows R t"
+    columns = "x y z and a quaternion, a matrix row by row, or 3 rows R t"
     rows = _fixed(table, (7, 12, 16, 4), columns, finite=False)
     lines = table.lines
     if rows.shape[1] != 7:
+        if quaternion is not None:
+            raise FormatError(f"{table.name}: its poses are matrices: leave --quaternion out")
         matrices, lines = _stacked(table, rows)
         matrices[:, :3, 3] *= LENGTHS_MM[pose_units]
         poses = np.tile(np.eye(4), (len(matrices), 1, 1))
         poses[:, : matrices.shape[1]] = matrices
     else:
+        if quaternion is None:
+            raise _order_unknown(table)
         poses = np.tile(np.eye(4), (len(rows), 1, 1))
         with naming(path):
             try:
@@ -379,12 +383,16 @@ def _columns(table: Table, quaternion: QuaternionOrder | None) -> Columns:
             f"pose numbers, u and v) or 10 (time, x, y, z, a quaternion, u and v) are needed{hint}"
         )
     if quaternion is None:
-        raise FormatError(
-            f"{table.row(0)}: 10 columns hold a quaternion: say whether its scalar comes "
-            "first or last (--quaternion wxyz or xyzw)"
-        )
+        raise _order_unknown(table)
     order = (5, 6, 7, 4) if quaternion == "wxyz" else (4, 5, 6, 7)
     return Columns(translation=(1, 2, 3), quaternion=order, time=0, point=(8, 9))
+
+
+def _order_unknown(table: Table) -> FormatError:
+    return FormatError(
+        f"{table.row(0)}: {len(table.rows[0])} columns hold a quaternion: say whether its scalar "
+        "comes first or last (--quaternion wxyz or xyzw)"
+    )
 
 
 def _used_rows(

@@ -153,7 +153,7 @@ def tool_poses(
         refuse(options, ("skip_invalid",), "is for tables with a header")
         poses = read_poses(
             source,
-            quaternion=options.quaternion or "xyzw",
+            quaternion=options.quaternion,
             pose_units=options.pose_units or "mm",
             invert_poses=options.invert_poses,
         )
