@@ -167,6 +167,15 @@ def test_points_in_mm_have_no_spacing_to_correct(slips):
     assert said is not None
     assert "check what gave them their mm" in said
     assert "estimate" not in said
+    assert 'pixel"' not in said
+    # Only points that are longer than they should be, by the size of a pixel, may be pixels.
+    said = wrong_frames(Problem.from_arrays(right.poses, right.points / [0.16, 0.13]))
+    assert "are 0.16 and 0.13 times as long as given" in said
+    assert 'or whether the points are pixels (kind="pixel" in Python, --units px at import)' in said
+    # Pixels of 0.1 mm look like poses in cm.
+    said = wrong_frames(Problem.from_arrays(right.poses, right.points * 10))
+    assert "the poses are in cm" in said
+    assert "and check whether the points are pixels" in said
 
 
 def test_pixels_that_no_image_has_are_told(slips):

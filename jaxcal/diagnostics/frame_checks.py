@@ -73,6 +73,9 @@ NEAR_MARKER_MM, NEAR_TRACKER_MM = 40.0, 300.0
 """With poses in cm, a target 400 mm from the probe's markers or a probe 3 m from the tracker comes
 out at these distances; hardly any is farther. Whatever comes out farther is in mm."""
 
+LIKELY_PIXEL_MM = (0.02, 0.6)
+"""Points in mm that are so many times as long as given may be pixels."""
+
 LARGE_PIXEL_MM = 1.5
 """The unit is in doubt where pixels are larger. Points in mm that are read as pixels have 1 mm."""
 
@@ -373,17 +376,22 @@ def _wrong_scale(data: ImageData, fit: _Fit) -> str | None:
             "u and v, or their two spacings, are exchanged: swap them", before, free, count
         )
     points = "the pixels' sizes" if data.pixels else "the points"
+    least, largest = LIKELY_PIXEL_MM
+    in_pixels = ""
+    if not data.pixels and least < scales.min() and scales.max() < largest:
+        in_pixels = ' whether the points are pixels (kind="pixel" in Python, --units px at import)'
     for unit, name in UNITS.items():
         for factor, wrong, other in ((1 / unit, "the poses", points), (unit, points, "the poses")):
             if (np.abs(np.log(scales / factor)) < UNIT_WITHIN).all():
                 told = f"{wrong} are in {name}, or {other} are {unit:g} times too large: give mm"
+                told += in_pixels and f", and check{in_pixels}"
                 in_mm = unit if factor < 1 else 1.0
                 return _sentence(told, before, in_mm**2 * free, count)
     if not data.pixels:
         told = (
             f"the points are {scales[0]:.3g} and {scales[1]:.3g} times as long as given: check "
             "what gave them their mm (pixel size, sound speed, pitch of the elements)"
-        )
+        ) + (in_pixels and f", or{in_pixels}")
     else:
         size = scales * data.spacing
         told = (
