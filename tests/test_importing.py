@@ -689,7 +689,7 @@ def test_a_stated_unit_is_not_advised_against(tmp_path):
         ("tool.yaml", "jaxcal export, apply and compare take it as CAL"),
         ("frame.png", "name the folder"),
         ("clip.mp4", "save its frames as PNG"),
-        ("sweep.mkv", "PLUS's EditSequenceFile converts what PLUS"),
+        ("sweep.mkv", "record as .igs.mha, or try PLUS's EditSequenceFile"),
         ("scene.mrml", "save its sequence from Slicer as"),
         ("a.bag", "save its poses as a table"),
     ],

@@ -97,8 +97,8 @@ _NOT_IMPORTED = {
     ".dcm": " (--spacing-from reads its pixel size)",
     ".vtk": "",
     **dict.fromkeys((".avi", ".mp4", ".mov"), " (save its frames as PNG in a folder)"),
-    ".mkv": " (PLUS's EditSequenceFile converts what PLUS or Slicer recorded to .igs.mha; of "
-    "another video save the frames as PNG in a folder)",
+    ".mkv": " (record as .igs.mha, or try PLUS's EditSequenceFile, or save its frames as PNG in a "
+    "folder)",
     **dict.fromkeys(
         (".bag", ".mcap", ".db3"),
         " (save its poses as a table, CSV, and its images as PNG in a folder)",
