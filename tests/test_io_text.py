@@ -252,6 +252,12 @@ def test_a_header_of_points_that_are_named_as_positions(tmp_path):
         read_pose_table(tmp_path / "table.csv")
 
 
+def test_a_header_of_imagej_is_told_how_to_convert(tmp_path):
+    (tmp_path / "table.csv").write_text(" ,Area,X,Y,Slice\n1,0,9.5,2,1\n")
+    with pytest.raises(FormatError, match=r"column 5, 'Slice', is .* Take 1 from each slice"):
+        read_pose_table(tmp_path / "table.csv")
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -141,6 +141,13 @@ def columns_of_header(names: list[str], quaternion: QuaternionOrder | None) -> C
         else:
             roles[role] = index
     strange = [k for k in rest if not (_CELL.fullmatch(bases[k]) or _NUMBERED.fullmatch(bases[k]))]
+    if "slice" in bases:
+        raise FormatError(
+            f"the header's column {bases.index('slice') + 1}, "
+            f"{quoted(names[bases.index('slice')])}, is not known: ImageJ and Fiji count slices "
+            "from 1, frames count from 0. Take 1 from each slice, and name the columns frame, u "
+            "and v (X and Y in pixels)"
+        )
     if strange:
         raise _unknown(names, strange[0])
     quaternion_columns = _quaternion(roles, numbered, quaternion)
