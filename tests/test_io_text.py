@@ -246,6 +246,26 @@ def test_a_header_of_paths_in_ros_messages(tmp_path, start, mark, parts):
     np.testing.assert_allclose(images.poses[:, :3, :3], np.tile(np.eye(3), (6, 1, 1)))
 
 
+def test_the_header_of_a_ros_message_gives_the_time(tmp_path):
+    """As ``rostopic echo -p`` writes it; from a bag, ``%time`` is the time of the recording."""
+    path, start = tmp_path / "table.csv", 1_600_000_000
+    names = ["%time", "field.header.seq", "field.header.stamp", "field.header.frame_id"]
+    names += [f"field.pose.position.{axis}" for axis in "xyz"]
+    names += [f"field.pose.orientation.{axis}" for axis in "xyzw"]
+    rows = [f"{start}500000000,{k},{start + k}000000000,camera,1,2,{k},0,0,0,1" for k in range(6)]
+    path.write_text("\n".join([",".join(names), *rows]))
+    table = read_pose_table(path, pose_units="m")
+    np.testing.assert_allclose(table.time, start + np.arange(6), atol=1e-6)
+    assert table.time_stated
+    assert table.frame is None
+    told = "columns that are not read: '%time', 'field.header.seq', 'field.header.frame_id'"
+    assert table.notes == [f"{path}: {told}"]
+    names[0], names[1] = "field.header.stamp", "%time"
+    path.write_text("\n".join([",".join(names), *rows]))
+    with pytest.raises(FormatError, match="columns 1 and 3 are both time"):
+        read_pose_table(path)
+
+
 def test_a_header_of_points_that_are_named_as_positions(tmp_path):
     (tmp_path / "table.csv").write_text("frame,x,y\n0,1,2\n")
     with pytest.raises(FormatError, match=r"x, y but not all of x, y and z \(points in the image"):

@@ -41,6 +41,8 @@ _UNIT = re.compile(
 )
 _OF_MESSAGE = re.compile(r".*[./]((?:position|translation|orientation|rotation)[./][xyzw])")
 """A part of a ROS message by its path, as ``pose.position.x``, without what stands before it."""
+_OF_HEADER = re.compile(r"field\.(?:.*\.)?(?:header\.(?P<part>seq|stamp|frame_id)|child_frame_id)")
+"""A part of a ROS message's header, or the name of its frame, as ``rostopic echo -p`` writes it."""
 _CELL = re.compile(r"([a-z]*?)_?([0-4])[_,]?([0-4])")
 _NUMBERED = re.compile(r"([a-z]*?)_?(\d{1,2})")
 _OTHER_ROTATION = re.compile(
@@ -82,6 +84,7 @@ class Columns:
         length_mm: one unit of translations in mm.
         point_unit: ``px`` or a unit of length; None where the header does not say.
         time_s: one unit of time in s; None where the header does not say.
+        not_read: names of columns of a ROS message that are not read.
     """
 
     matrix: tuple[int, ...] | None = None
@@ -95,6 +98,7 @@ class Columns:
     length_mm: float | None = None
     point_unit: str | None = None
     time_s: float | None = None
+    not_read: tuple[str, ...] = ()
 
 
 def names_columns(cells: list[str]) -> bool:
@@ -121,6 +125,7 @@ def columns_of_header(names: list[str], quaternion: QuaternionOrder | None) -> C
         if _OTHER_ROTATION.fullmatch(_split(name)[0]):
             raise FormatError(f"the header's column {index + 1}, {quoted(name)}: {CONVERT}")
     bases, units = zip(*(_base_and_unit(name) for name in names), strict=True)
+    not_read = _not_read(names)
     roles: dict[str, int] = {}
     rest: list[int] = []
     numbered = [(int(base[1]), k) for k, base in enumerate(bases) if re.fullmatch("q[0-4]", base)]
@@ -129,7 +134,7 @@ def columns_of_header(names: list[str], quaternion: QuaternionOrder | None) -> C
         if base == "q0" and len(numbered) == 1:
             role = "qw"
         # pandas and R write the numbers of the rows as a first column without a name.
-        if role == "ignored" or (index == 0 and not base):
+        if role == "ignored" or index in not_read or (index == 0 and not base):
             continue
         if role is None:
             rest.append(index)
@@ -179,7 +184,24 @@ def columns_of_header(names: list[str], quaternion: QuaternionOrder | None) -> C
         length_mm=_length(lengths, names, list(units)),
         point_unit=point_unit,
         time_s=None if time_unit is None else TIMES_S[time_unit],
+        not_read=tuple(names[index] for index in not_read),
     )
+
+
+def _not_read(names: list[str]) -> list[int]:
+    """Columns of ``rostopic echo -p`` that are neither a pose nor the time of its measurement.
+
+    The first one, ``%time``, is the time of the recording where the message comes from a bag.
+    """
+    lower = [name.strip().lower() for name in names]
+    found = [_OF_HEADER.fullmatch(name) for name in lower]
+    parts = [None if match is None else match["part"] for match in found]
+    stamped = "stamp" in parts
+    return [
+        index
+        for index, (name, match, part) in enumerate(zip(lower, found, parts, strict=True))
+        if (match is not None and part != "stamp") or (stamped and name == "%time")
+    ]
 
 
 def _unknown(names: list[str], column: int) -> FormatError:
@@ -199,6 +221,9 @@ def _split(name: str) -> tuple[str, str | None]:
 
 def _base_and_unit(name: str) -> tuple[str, str | None]:
     base, unit = _split(name)
+    of_header = _OF_HEADER.fullmatch(name.strip().lower())
+    if of_header is not None and of_header["part"] == "stamp":
+        return "time", "ns"
     if base == "seconds" and unit is None:
         unit = "s"
     if base == "%time" and unit is None:

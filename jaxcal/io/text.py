@@ -75,6 +75,7 @@ class PoseTable:
         skipped: the rows of the table that were left out as invalid.
         length_stated: whether the header states the unit of translations.
         time_stated: whether times are dates, or the header states their unit.
+        not_read: names of columns of a ROS message that were not read.
     """
 
     name: str
@@ -91,6 +92,7 @@ class PoseTable:
     skipped: tuple[int, ...] = ()
     length_stated: bool = False
     time_stated: bool = False
+    not_read: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.lines)
@@ -98,12 +100,16 @@ class PoseTable:
     @property
     def notes(self) -> list[str]:
         """What was left out, in words."""
+        said = []
+        if self.not_read:
+            columns = ", ".join(map(quoted, self.not_read))
+            said = [f"{self.name}: columns that are not read: {columns}"]
         if not self.skipped:
-            return []
+            return said
         rows = counted(len(self.skipped), "invalid row")
         numbers = ", ".join(map(str, self.skipped[:_MOST_NAMED]))
         more = ", ..." if len(self.skipped) > _MOST_NAMED else ""
-        return [f"{self.name}: {rows} left out ({numbers}{more}, counted from 0)"]
+        return [*said, f"{self.name}: {rows} left out ({numbers}{more}, counted from 0)"]
 
 
 def read_pose_table(
@@ -170,6 +176,7 @@ def read_pose_table(
             skipped=skipped,
             length_stated=columns.length_mm is not None,
             time_stated=clock is not None or columns.time_s is not None,
+            not_read=columns.not_read,
         )
 
 
