@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from jaxcal import FormatError, InputError
 from jaxcal.io import lines as text_files
 from jaxcal.io import table
+from jaxcal.io.importing.files import import_files
 from jaxcal.io.importing.frame_poses import tool_poses
 from jaxcal.io.importing.sources import ImportOptions
 from jaxcal.io.slicer import read_markups
@@ -109,6 +110,42 @@ def test_a_pair_may_have_a_matrix_in_a_row_and_commas(pair, rows, comma):
     np.testing.assert_allclose(images.poses[:, :3, :3], pair[2][:, :3, :3], atol=1e-12)
     np.testing.assert_allclose(images.poses[:, :3, 3], 10 * pair[2][:, :3, 3], atol=1e-9)
     np.testing.assert_array_equal(images.measurements, pair[3])
+
+
+@pytest.mark.parametrize("rows", [12, 16, 4])
+@pytest.mark.parametrize("order", [[0, 1], [1, 0]])
+def test_points_of_a_pair_may_have_a_header(pair, rows, order):
+    """Poses as MATLAB writes them, and points that were picked in another program."""
+    poses = pair[2][:, :3] if rows != 16 else pair[2]
+    np.savetxt(pair[0], poses.reshape(-1, rows), delimiter=",")
+    lines = [",".join(np.array(["u", "v"])[order])]
+    lines += [",".join(map(repr, row)) for row in pair[3][:, order].tolist()]
+    pair[1].write_text("\n".join(lines))
+    images = import_files(pair[:2]).recording.calibration
+    np.testing.assert_allclose(images.poses, pair[2], atol=1e-12)
+    np.testing.assert_array_equal(images.measurements, pair[3])
+    assert images.kind == "pixel"
+    assert images.frame is None
+
+
+@pytest.mark.parametrize(
+    ("header", "told"),
+    [
+        ("frame,u,v", "its header names other columns than u and v, but .*poses.txt has no header"),
+        ("time,u,v", "other columns .* keep u and v alone, one point for each pose in the same"),
+        ("u,v,valid", "other columns"),
+        ("u [mm],v [mm]", "its header says that points are in mm, but .*poses.txt has no header"),
+        ("lateral,range", "its header says that points are in mm"),
+        ("m11,m12", "'m11', is not known"),
+        ("x,y", "points in the image are named u and v"),
+    ],
+)
+def test_headers_of_points_that_poses_without_one_do_not_go_with(pair, header, told):
+    np.savetxt(pair[0], pair[2].reshape(-1, 16), delimiter=",")
+    row = ",".join(["1"] * len(header.split(",")))
+    pair[1].write_text("\n".join([header, *[row] * 6]))
+    with pytest.raises(FormatError, match=rf"points\.txt: .*{told}"):
+        import_files(pair[:2])
 
 
 def test_a_pair_may_have_decimal_commas(pair):

@@ -24,12 +24,14 @@ from jaxcal.data.recording import MINIMUM_IMAGES, Recording, make_images
 from jaxcal.io.columns import CONVERT, LENGTHS_MM, Columns, columns_of_header
 from jaxcal.io.given_files import naming
 from jaxcal.io.lines import text_lines
-from jaxcal.io.table import Table, parse_numbers, read_table
+from jaxcal.io.table import Table, first_line, parse_numbers, read_table
 from jaxcal.runtime.array_types import Float, Int
 from jaxcal.runtime.messages import counted, quoted
 
 _LATEST_S = 1e11
 """Latest time, s after any beginning: three thousand years. Stamps in ms or ns are beyond it."""
+MATRIX_WIDTHS = (4, 12, 16)
+"""Columns of poses without a header: 3 or 4 rows for each, or the matrix row by row."""
 _MOST_NAMED = 20
 """Largest number of rows that are named."""
 
@@ -226,7 +228,8 @@ def read_crosswire(
         transforms_path: 3 rows ``R_i0 R_i1 R_i2 t_i`` for each image, i = 0, 1, 2: probe ->
             tracker. The row 0 0 0 1 may follow in all images. Or a row of 12 or 16 numbers for each
             image, the matrix row by row.
-        points_path: a row ``u v`` for each image: lateral and axial, px.
+        points_path: a row ``u v`` for each image: lateral and axial, px. A header may name the two
+            columns, and no others.
         spacing_mm: [lateral, axial] mm per px, when known.
         pose_units: of translations in the file.
         invert_poses: those of the file are tracker -> probe; their inverses are taken.
@@ -237,17 +240,16 @@ def read_crosswire(
 
     Raises:
         FormatError: a file that cannot be read, a row of another length, something that is not a
-            number, rows that do not make whole poses, or files of different lengths; the file and
-            the line are named.
+            number, rows that do not make whole poses, a header of the points that names more than
+            u and v, or files of different lengths; the file and the line are named.
         InputError: poses or pixels that cannot be used (see
         :func:`jaxcal.data.recording.make_images`).
     """
     transforms = _plain_table(transforms_path)
     columns = "3 rotation numbers and a translation, or a matrix row by row; points come second"
-    poses, _ = _stacked(transforms, _fixed(transforms, (4, 12, 16), columns))
-    points = _plain_table(points_path)
-    pixels = _fixed(points, (2,), "u and v")
-    name = f"{transforms.name} with {points.name}"
+    poses, _ = _stacked(transforms, _fixed(transforms, MATRIX_WIDTHS, columns))
+    pixels = _pixels_in_order(points_path, transforms.name)
+    name = f"{transforms.name} with {os.fspath(points_path)}"
     if len(poses) != len(pixels):
         raise FormatError(
             f"{name}: {len(poses)} poses but {len(pixels)} points: each image has one pose "
@@ -287,7 +289,7 @@ def read_poses(
     """
     table = _plain_table(path)
     columns = "x y z and a quaternion, a matrix row by row, or 3 rows R t"
-    rows = _fixed(table, (7, 12, 16, 4), columns, finite=False)
+    rows = _fixed(table, (7, *MATRIX_WIDTHS), columns, finite=False)
     lines = table.lines
     if rows.shape[1] != 7:
         if quaternion is not None:
@@ -316,6 +318,33 @@ def read_poses(
             return inverse_poses(check_poses(poses, labels=_labels(lines)))
         except InputError as error:
             raise FormatError(str(error)) from None
+
+
+def width_without_header(path: str | os.PathLike[str]) -> int:
+    """How many numbers the first row of a text file has; 0 where it is not numbers alone."""
+    table = _plain_table(path)
+    numbers = parse_numbers(table.rows[0], decimal_comma=table.separator != ",")
+    return 0 if None in numbers else len(numbers)
+
+
+def _pixels_in_order(path: str | os.PathLike[str], poses: str) -> Float[np.ndarray, "n 2"]:
+    """Rows u and v that belong to the poses in a file without a header, in their order."""
+    if not first_line(path)[1]:
+        return _fixed(_plain_table(path), (2,), "u and v")
+    table = read_table(path)
+    with naming(path):
+        columns = columns_of_header(table.header or [], None)
+        both = f"{poses} has no header: give it one that names its columns as well"
+        if columns.point is None or len(table.header or []) > len(columns.point):
+            raise FormatError(
+                f"its header names other columns than u and v, but {both}; or keep u and v alone, "
+                "one point for each pose in the same order"
+            )
+        if columns.point_unit not in (None, "px"):
+            raise FormatError(
+                f"its header says that points are in {columns.point_unit}, but {both}"
+            )
+        return table.numbers(columns.point)
 
 
 def _plain_table(path: str | os.PathLike[str]) -> Table:
@@ -383,8 +412,8 @@ def _columns(table: Table, quaternion: QuaternionOrder | None) -> Columns:
         if width in (2, 3):
             names = "u,v" if width == 2 else "frame,u,v"
             hint = f" (name {width} columns of points by a first line {names})"
-        if width in (4, 12, 16):
-            hint = " (poses alone are one of a pair without headers: POSES POINTS OUT.h5)"
+        if width in MATRIX_WIDTHS:
+            hint = " (poses alone are the first of two files: POSES POINTS OUT.h5)"
         raise FormatError(
             f"{table.row(0)}: {width} columns without a header; 15 or 19 (time, 12 or 16 "
             f"pose numbers, u and v) or 10 (time, x, y, z, a quaternion, u and v) are needed{hint}"

@@ -13,8 +13,14 @@ from jaxcal.io.importing.imported import Imported, good_time, naming_pose_units,
 from jaxcal.io.importing.poses_by_time import PoseTrack
 from jaxcal.io.importing.sources import ImportOptions, kind_of, read_rows, refuse
 from jaxcal.io.importing.two_tables import one_of_two_tables
-from jaxcal.io.table import first_line, parse_numbers, read_table
-from jaxcal.io.text import PoseTable, read_crosswire, recording_of
+from jaxcal.io.table import first_line
+from jaxcal.io.text import (
+    MATRIX_WIDTHS,
+    PoseTable,
+    read_crosswire,
+    recording_of,
+    width_without_header,
+)
 from jaxcal.runtime.array_types import Float
 
 
@@ -27,7 +33,7 @@ def from_tables(sources: Sequence[str | os.PathLike[str]], options: ImportOption
     unused = "source", "target", "points", "target_kind", "region", "orientation"
     refuse(options, unused, "does not go with a table of poses and points: it is for sequences")
     options = replace(options, spacing_mm=pixel_size(None, options), spacing_from=None)
-    if two and _have_headers(sources):
+    if two and not _is_pair(sources):
         tables = [read_rows(each, options, ignore_time=options.ignore_time) for each in sources]
         return _from_table(*one_of_two_tables(*tables, lag_s=options.lag_s), options)
     refuse(options, ("lag_s",), "is for poses that are matched to images by their times")
@@ -54,12 +60,14 @@ def from_tables(sources: Sequence[str | os.PathLike[str]], options: ImportOption
     return _from_table(table, table.notes, 0, options)
 
 
-def _have_headers(sources: Sequence[str | os.PathLike[str]]) -> bool:
-    """Whether two text files are tables with headers, and not the pair of rows R|t and u v."""
-    if not any(first_line(source)[1] for source in sources):
-        return False
-    first = parse_numbers(read_table(sources[0], header=False).rows[0])
-    return len(first) != 4 or None in first
+def _is_pair(sources: Sequence[str | os.PathLike[str]]) -> bool:
+    """Whether two text files are matrices without a header and points, and not two tables."""
+    of_poses, of_points = (first_line(source)[1] for source in sources)
+    if not (of_poses or of_points):
+        return True
+    width = width_without_header(sources[0])
+    # Rows R t may follow a comment that reads like a header.
+    return width == 4 or (width in MATRIX_WIDTHS and not of_poses)
 
 
 def _from_table(table: PoseTable, notes: list[str], lost: int, options: ImportOptions) -> Imported:
