@@ -11,6 +11,7 @@ import pytest
 from scipy import ndimage
 
 import jaxcal
+from jaxcal.data.segmentation import speckle as speckle_module
 from jaxcal.data.segmentation.image import images_from_frames, localise
 from jaxcal.data.segmentation.spot import half_maximum, local_maxima
 
@@ -131,6 +132,24 @@ def test_a_shape_that_does_not_fit_is_paid_for_in_the_covariance(drawn):
     assert (spot.residual[used] > crossing.residual[half][used]).mean() > 0.95
     error = spot.position[used] - truth[half][used]
     assert normalised(error, spot.covariance[used]).mean() < 2.4
+
+
+def test_the_size_of_long_structures_is_that_of_single_lags():
+    """All lags at once, by Fourier transforms, where one by one would take most of the time."""
+    rng = np.random.default_rng(8)
+    for size in (2.0, 9.0, 30.0, 200.0):
+        values = ndimage.gaussian_filter1d(rng.normal(size=(300, 200)), size, axis=0)
+        weight = (rng.random(values.shape) > 0.2).astype(float)
+        values = (values - values.mean()) * weight
+        assert speckle_module._speckle_size(values, weight) == pytest.approx(
+            _by_single_lags(values, weight), 1e-9
+        )
+
+
+def _by_single_lags(values: np.ndarray, weight: np.ndarray) -> float:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(speckle_module, "_SINGLE_LAGS", 1000)
+        return speckle_module._speckle_size(values, weight)
 
 
 def test_speckle_alone_is_not_taken_for_a_target():
