@@ -364,6 +364,33 @@ def test_poses_and_points_in_two_tables(tmp_path, key, reverse):
     np.testing.assert_array_equal(images.measurements, PIXELS[order])
     if key == "frames":
         np.testing.assert_array_equal(images.frame, 10 * order)
+    # Without numbers of frames, rows of the table of points count.
+    numbers = (0, 20, 30, 40, 50) if key == "frames" else (0, 2, 3, 4, 5)
+    found = import_files(files, ImportOptions(frames=numbers))
+    used = order != 1 if key == "frames" else np.arange(6) != 1
+    np.testing.assert_allclose(found.recording.calibration.poses, POSES[order[used]], atol=1e-12)
+    np.testing.assert_array_equal(found.recording.calibration.measurements, PIXELS[order[used]])
+    kept = 10 * order[used] if key == "frames" else np.flatnonzero(used)
+    np.testing.assert_array_equal(found.recording.calibration.frame, kept)
+    assert found.notes[-1].endswith("are used, as told")
+    assert found.most_lost is False
+
+
+def test_only_some_rows_of_a_table(tmp_path):
+    """The first of two recordings in one file, whose times begin again in the second."""
+    path = tmp_path / "t.csv"
+    path.write_text("\n".join(table(["time", *NAMES], [[0, 1, 2, 3, 0, 1], *COLUMNS])))
+    recording, notes, *_ = import_files([path], ImportOptions(frames=(0, 1, 2, 3)))
+    np.testing.assert_allclose(recording.calibration.poses, POSES[:4], atol=1e-12)
+    np.testing.assert_array_equal(recording.calibration.time, [0, 1, 2, 3])
+    assert notes == [f"only frames 0 to 3 of {path} are used, as told"]
+    with pytest.raises(InputError, match=r"t\.csv: has frames 0 to 5, none of --frames 7 to 9"):
+        import_files([path], ImportOptions(frames=(7, 8, 9)))
+    pair = tmp_path / "poses.txt", tmp_path / "points.txt"
+    np.savetxt(pair[0], POSES.reshape(-1, 16))
+    np.savetxt(pair[1], PIXELS)
+    with pytest.raises(InputError, match="--frames does not go with a pair of text files"):
+        import_files(pair, ImportOptions(frames=(0, 1, 2, 3)))
 
 
 def _named(names, columns):

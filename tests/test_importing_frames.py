@@ -153,6 +153,49 @@ def test_segment_a_sequence(tmp_path, sequence, capsys):
     assert "dB over the background" in record["per_frame"][HIDDEN]["reason"]
 
 
+def test_only_some_frames_of_a_sequence(tmp_path, sequence, capsys):
+    """They keep their numbers; the others are neither searched nor counted."""
+    out = tmp_path / "o.h5"
+    assert main(["import", str(sequence), str(out), "--frames", "1-4,6,8-20"]) == 0
+    said = capsys.readouterr().out.splitlines()
+    told = f"- only frames 1 to 4, 6, 8 to 20 of {sequence} are used, as told (12 of these 18 "
+    assert told + "numbers name no frame)" in said
+    assert "- 1 of 6 frames left out: their tracking was not OK" in said
+    assert not any("credible" in line or "image was" in line for line in said)
+    np.testing.assert_array_equal(jaxcal.load(out).calibration.frame, [1, 3, 4, 6, 8])
+    assert main(["segment", str(sequence), "--frames", "1-4,6,8", "--json"]) == 0
+    record = json.loads(capsys.readouterr().out)
+    assert (record["found"], record["not_tracked"], record["not_selected"]) == (5, 1, 3)
+    points = [f"{k},{u},{v}" for k, (u, v) in enumerate(POINTS)]
+    (tmp_path / "p.csv").write_text("\n".join(["frame,u,v", *points]))
+    placed = [str(sequence), str(tmp_path / "p.csv"), str(out)]
+    assert main(["import", *placed, "--frames", "0-4,7"]) == 0
+    images = jaxcal.load(out).calibration
+    np.testing.assert_array_equal(images.frame, [0, 1, 3, 4])
+    np.testing.assert_allclose(images.measurements, POINTS[[0, 1, 3, 4]])
+    capsys.readouterr()
+    for frames, message in (
+        ("9,12", "has frames 0 to 8, none of --frames 9, 12"),
+        ("2", "no frame that is used has tracking from Probe to Tracker"),
+        ("5-3", "'5-3' is no list of images"),
+    ):
+        assert main(["import", *placed, "--frames", frames]) == 2
+        assert message in capsys.readouterr().err
+
+
+def test_the_lag_is_estimated_from_the_frames_that_are_used(tmp_path, lagging):
+    """A target that is moved later spoils the estimate, unless these frames are left out."""
+    times, points = lagging
+    points[50:] += 200
+    rows = [f"{t!r},{u!r},{v!r}" for t, (u, v) in zip(times.tolist(), points.tolist(), strict=True)]
+    (tmp_path / "p.csv").write_text("\n".join(["time,u,v", *rows]))
+    options = ImportOptions(poses=tmp_path / "t.igs.mha", lag_s="auto", frames=tuple(range(50)))
+    found = import_files([tmp_path / "i.igs.mha", tmp_path / "p.csv"], options)
+    assert "estimated from 50 points" in " ".join(found.notes)
+    assert "images lag by 0.08" in " ".join(found.notes)
+    assert len(found.recording) == 50
+
+
 def test_an_import_of_few_frames_says_why_and_how_to_go_on(tmp_path, capsys):
     path = tmp_path / "n.igs.mha"
     frames = [FRAMES[k] if k < 4 else FRAMES[HIDDEN] for k in range(COUNT)]

@@ -185,7 +185,7 @@ def _segment_frames(source: str, out: str | None, as_json: bool, options: dict[s
     else:
         unscaled = recording.calibration.spacing_mm is None
         hint = "; a pixel's size is not known: calibrate with --estimate scale" if unscaled else ""
-        count = f"{len(found.found)} of {len(found)} frames segmented ({found.target})"
+        count = f"{len(found.found)} of {found.asked} frames segmented ({found.target})"
         told = (f"{target}: {count}{hint}", *(f"- {note}" for note in notes))
         print_page(*told, *by_hand(source, found, options))
     return ExitCode.NOT_CONVERGED if most_lost else ExitCode.CONVERGED

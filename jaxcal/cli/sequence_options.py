@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import click
 
-from jaxcal.cli.common import POSITIVE, Verbatim
+from jaxcal.cli.common import POSITIVE, ImageNumbers, Verbatim
 from jaxcal.data.names import LengthUnit, Orientation, QuaternionOrder
 from jaxcal.runtime.messages import command_line
 
@@ -119,6 +119,13 @@ region_option = click.option(
     help="Part of the frames to look in, px: its first column and row, and its size.",
 )
 SEARCH = (
+    click.option(
+        "--frames",
+        type=ImageNumbers(),
+        metavar="LIST",
+        help="Use only these frames of a sequence, or rows of a table, e.g. 10-50,60: by their own "
+        "numbers if the file has some, else from 0.",
+    ),
     click.option(
         "--target",
         "target_kind",

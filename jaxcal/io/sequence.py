@@ -148,9 +148,14 @@ class TrackedSequence:
             return quoted(self.files[row])
         return f"frame {row if self.numbers is None else self.numbers[row]}"
 
+    @property
+    def all_numbers(self) -> Int[np.ndarray, " n"]:
+        """Numbers by which other files name the frames, -1 for a frame without one."""
+        return np.arange(len(self)) if self.numbers is None else self.numbers
+
     def numbers_of(self, rows: Int[np.ndarray, " m"]) -> Int[np.ndarray, " m"] | None:
         """Numbers by which other files name these frames; None if one of them has none."""
-        numbers = rows if self.numbers is None else self.numbers[rows]
+        numbers = self.all_numbers[rows]
         return numbers if (numbers >= 0).all() else None
 
     def rows_of(
@@ -163,7 +168,7 @@ class TrackedSequence:
         Raises:
             InputError: a number that no frame has, or that several have.
         """
-        known = np.arange(len(self)) if self.numbers is None else self.numbers
+        known = self.all_numbers
         order = np.argsort(known, kind="stable")
         first, after = (
             np.searchsorted(known, numbers, side=side, sorter=order) for side in ("left", "right")

@@ -99,6 +99,20 @@ class PoseTable:
     def __len__(self) -> int:
         return len(self.lines)
 
+    def of(self, kept: Int[np.ndarray, " m"]) -> PoseTable:
+        """Some of its rows."""
+        chosen = {
+            name: None if (values := getattr(self, name)) is None else values[kept]
+            for name in ("poses", "points", "time", "velocity", "frame")
+        }
+        return replace(
+            self,
+            lines=[self.lines[row] for row in kept],
+            rows=[self.rows[row] for row in kept],
+            file=None if self.file is None else tuple(self.file[row] for row in kept),
+            **chosen,
+        )
+
     @property
     def notes(self) -> list[str]:
         """What was left out, in words."""

@@ -16,7 +16,7 @@ from jaxcal.io.importing.sources import Assignment
 from jaxcal.io.sequence import TrackedSequence
 from jaxcal.io.slicer import pixels_from_markups, read_markups
 from jaxcal.io.text import PoseTable
-from jaxcal.runtime.array_types import Float, Int
+from jaxcal.runtime.array_types import Bool, Float, Int
 from jaxcal.runtime.messages import counted, quoted, seconds
 
 _SLACK = 0.5
@@ -39,6 +39,12 @@ class FramePoints(NamedTuple):
     kind: Literal["pixel", "point"]
     notes: list[str]
     covariance: Float[np.ndarray, "m 2 2"] | None = None
+
+    def of(self, selected: Bool[np.ndarray, " n"]) -> FramePoints:
+        """Those in selected ones of all n frames."""
+        kept = selected[self.rows]
+        covariance = None if self.covariance is None else self.covariance[kept]
+        return self._replace(rows=self.rows[kept], points=self.points[kept], covariance=covariance)
 
 
 def points_of_markups(

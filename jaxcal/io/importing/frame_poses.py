@@ -102,9 +102,13 @@ def tracking_of_table(table: PoseTable, images: TrackedSequence) -> TrackedSeque
 
 
 def tracked_poses(
-    sequence: TrackedSequence, options: ImportOptions
+    sequence: TrackedSequence,
+    options: ImportOptions,
+    selected: Bool[np.ndarray, " n"] | None = None,
 ) -> tuple[Float[np.ndarray, "n 4 4"], Bool[np.ndarray, " n"], FramePair, list[str]]:
     """Poses of a sequence, where they can be used, their frames, and what was assumed and left out.
+
+    Frames that are not ``selected`` are not counted.
 
     Raises:
         InputError: no way between the frames, or no frame with tracking.
@@ -117,11 +121,13 @@ def tracked_poses(
     poses, valid = sequence.poses(start, end)
     if options.invert_poses and not options.by_time:
         poses = inverse_poses(poses)
-    lost = len(sequence) - int(valid.sum())
+    wanted = np.ones(len(sequence), bool) if selected is None else selected
+    lost, count = int((wanted & ~valid).sum()), int(wanted.sum())
     if lost and not options.by_time:
-        notes.append(f"{lost} of {len(sequence)} frames left out: their tracking was not OK")
-    if not valid.any():
-        raise InputError(f"{sequence.source}: no frame has tracking from {start} to {end}")
+        notes.append(f"{lost} of {count} frames left out: their tracking was not OK")
+    if lost == count:
+        which = "no frame" if count == len(sequence) else "no frame that is used"
+        raise InputError(f"{sequence.source}: {which} has tracking from {start} to {end}")
     return poses, valid, (start, end), notes
 
 

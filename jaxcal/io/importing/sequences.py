@@ -29,7 +29,7 @@ from jaxcal.io.importing.poses_by_time import (
     lag_of_points,
     with_poses_by_time,
 )
-from jaxcal.io.importing.sources import ImportOptions, kind_of, read_rows, refuse
+from jaxcal.io.importing.sources import ImportOptions, kind_of, read_rows, refuse, selected
 from jaxcal.io.importing.target_search import FrameResults, search_target
 from jaxcal.io.sequence import TrackedSequence
 from jaxcal.runtime.array_types import Bool, Float, Int
@@ -50,8 +50,10 @@ def from_sequence(
     points = next((source for source in sources if source not in tracked), None)
     _refuse_unused(points, options)
     sequence, tracking, notes = opened(tracked[0], options)
-    placed = None if points is None else _points(points, sequence, options)
-    posed = _posed(sequence, tracking, placed, options)
+    used, told = selected(sequence.all_numbers, options, sequence.source)
+    notes += told
+    placed = None if points is None else _points(points, sequence, options).of(used)
+    posed = _posed(sequence, tracking, placed, used, options)
     sequence, spacing = posed.sequence, pixel_size(posed.sequence, options)
     with naming_pose_units(options, sequence.length_stated):
         if placed is None or points is None:
@@ -78,7 +80,8 @@ class _Posed(NamedTuple):
     Attributes:
         sequence: of n frames.
         poses: (n, 4, 4) probe -> tracker, mm.
-        valid: (n,) True for the frames whose pose can be used.
+        valid: (n,) True for the selected frames whose pose can be used.
+        selected: (n,) True for the frames that were asked for.
         frames: between which the poses lead.
         track: how the probe moved between the frames; None where that is not known.
         lag_s: by how much images lag behind these poses.
@@ -90,6 +93,7 @@ class _Posed(NamedTuple):
     sequence: TrackedSequence
     poses: Float[np.ndarray, "n 4 4"]
     valid: Bool[np.ndarray, " n"]
+    selected: Bool[np.ndarray, " n"]
     frames: FramePair
     track: PoseTrack | None
     lag_s: float
@@ -102,6 +106,7 @@ def _posed(
     sequence: TrackedSequence,
     tracking: TrackedSequence | None,
     placed: FramePoints | None,
+    used: Bool[np.ndarray, " n"],
     options: ImportOptions,
 ) -> _Posed:
     """The frames with their own poses, or with those of ``tracking`` at their times."""
@@ -110,19 +115,20 @@ def _posed(
     if tracking is not None:
         track = PoseTrack.of(tracking)
         if lag_s == "auto":
-            lag_s, note, results = _estimated_lag(sequence, placed, track, options)
+            lag_s, note, results = _estimated_lag(sequence, placed, track, used, options)
             notes.append(note)
         sequence, said = with_poses_by_time(sequence, tracking, lag_s)
         notes += said
     assert lag_s != "auto"
-    poses, valid, frames, said = tracked_poses(sequence, options)
+    poses, valid, frames, said = tracked_poses(sequence, options, used)
     notes += said
     if track is None:
         own = replace(sequence, transforms={frames: poses}, valid={frames: valid})
         with suppress(InputError):
             track = PoseTrack.of(own)
     by_time = tracking is not None
-    return _Posed(sequence, poses, valid, frames, track, lag_s, by_time, results, notes)
+    usable = valid & used
+    return _Posed(sequence, poses, usable, used, frames, track, lag_s, by_time, results, notes)
 
 
 class _Seen(NamedTuple):
@@ -149,12 +155,12 @@ def _searched(posed: _Posed, spacing: tuple[float, float] | None, options: Impor
     """The target as it is found in the frames."""
     sequence, results = posed.sequence, posed.results
     if results is None:
-        results = search_target(sequence, posed.valid, options)
+        results = search_target(sequence, posed.valid, posed.selected, options)
     else:
         results = results.of_tracked(posed.valid)
     used = _found_points(sequence, results, options.minimum)
     notes = fixed_mark(used.points, posed.poses[used.rows]) + tail_of_echoes(results, spacing)
-    return _Seen(used, len(sequence), "frames", sequence.source, notes, results)
+    return _Seen(used, results.asked, "frames", sequence.source, notes, results)
 
 
 def _placed(posed: _Posed, placed: FramePoints, points: str | os.PathLike[str]) -> _Seen:
@@ -211,12 +217,13 @@ def _estimated_lag(
     sequence: TrackedSequence,
     placed: FramePoints | None,
     track: PoseTrack,
+    used: Bool[np.ndarray, " n"],
     options: ImportOptions,
 ) -> tuple[float, str, FrameResults | None]:
     """The lag and a note, and the target in all frames if it had to be looked for."""
     results = None
     if placed is None:
-        results = search_target(sequence, np.ones(len(sequence), bool), options)
+        results = search_target(sequence, np.ones(len(sequence), bool), used, options)
         rows, points = results.found, results.position[results.found]
     else:
         shown = _shown(sequence, placed.rows)
@@ -289,10 +296,10 @@ def _found_points(sequence: TrackedSequence, results: FrameResults, minimum: int
         )
     notes = []
     if blank:
-        notes.append(f"{blank} of {len(results)} frames left out: their image was not OK")
+        notes.append(f"{blank} of {results.asked} frames left out: their image was not OK")
     if hidden:
         why = "; ".join(f"{reason}: {count}" for reason, count in results.reasons.items())
         notes.append(
-            f"{hidden} of {len(results)} frames left out: no credible target in them ({why})"
+            f"{hidden} of {results.asked} frames left out: no credible target in them ({why})"
         )
     return FramePoints(used, results.position[used], "pixel", notes, results.covariance[used])

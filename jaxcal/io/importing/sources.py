@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+
 from jaxcal import FormatError, InputError
 from jaxcal.data.names import LengthUnit, Orientation, QuaternionOrder
 from jaxcal.data.recording import MINIMUM_IMAGES
@@ -16,6 +18,8 @@ from jaxcal.io.sequence_files import EXTENSIONS, read_sequence
 from jaxcal.io.slicer import EXTENSIONS as MARKUPS
 from jaxcal.io.text import PoseTable, read_pose_table
 from jaxcal.io.trackers import is_tracker_export, read_tracker
+from jaxcal.runtime.array_types import Bool, Int
+from jaxcal.runtime.messages import runs_in_words
 
 Assignment = Literal["order", "labels"]
 """How points without a time or a frame's number are assigned to frames: one for each frame in
@@ -46,6 +50,7 @@ class ImportOptions:
             tracker's export or a table with times for a sequence.
         lag_s: an image stamped t shows what was at t - lag; ``auto``: estimated from the points.
         spacing_from: DICOM clip that states the pixel size.
+        frames: numbers of the frames, or of the rows of a table, that are used; None: all.
         minimum: least number of images.
     """
 
@@ -65,6 +70,7 @@ class ImportOptions:
     poses: str | os.PathLike[str] | None = None
     lag_s: float | Literal["auto"] = 0.0
     spacing_from: str | os.PathLike[str] | None = None
+    frames: tuple[int, ...] | None = None
     minimum: int = MINIMUM_IMAGES
 
     @property
@@ -83,6 +89,28 @@ def refuse(options: ImportOptions, names: Sequence[str], why: str) -> None:
         if getattr(options, name) != getattr(ImportOptions, name):
             flag = _FLAGS.get(name, f"--{name.replace('_', '-')}")
             raise InputError(f"{flag} {why}")
+
+
+def selected(
+    numbers: Int[np.ndarray, " n"], options: ImportOptions, name: str
+) -> tuple[Bool[np.ndarray, " n"], list[str]]:
+    """Which of the frames with these numbers are used, and a note if not all are asked for.
+
+    A frame without a number has -1.
+
+    Raises:
+        InputError: no frame that is used.
+    """
+    if options.frames is None:
+        return np.ones(len(numbers), bool), []
+    chosen, asked = np.isin(numbers, options.frames), runs_in_words(options.frames)
+    if not chosen.any():
+        known = numbers[numbers >= 0]
+        there = f"frames {known.min()} to {known.max()}" if len(known) else "frames without numbers"
+        raise InputError(f"{name}: has {there}, none of --frames {asked}")
+    unknown = len(options.frames) - len(np.unique(numbers[chosen]))
+    lost = f" ({unknown} of these {len(options.frames)} numbers name no frame)" if unknown else ""
+    return chosen, [f"only frames {asked} of {name} are used, as told{lost}"]
 
 
 SEQUENCES = ("sequence", "tracker", "scan", "folder")

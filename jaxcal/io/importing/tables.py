@@ -11,7 +11,7 @@ import numpy as np
 from jaxcal import InputError
 from jaxcal.io.importing.imported import Imported, good_time, naming_pose_units, pixel_size
 from jaxcal.io.importing.poses_by_time import PoseTrack
-from jaxcal.io.importing.sources import ImportOptions, kind_of, read_rows, refuse
+from jaxcal.io.importing.sources import ImportOptions, kind_of, read_rows, refuse, selected
 from jaxcal.io.importing.two_tables import one_of_two_tables
 from jaxcal.io.table import first_line
 from jaxcal.io.text import (
@@ -35,12 +35,12 @@ def from_tables(sources: Sequence[str | os.PathLike[str]], options: ImportOption
     options = replace(options, spacing_mm=pixel_size(None, options), spacing_from=None)
     if two and not _is_pair(sources):
         tables = [read_rows(each, options, ignore_time=options.ignore_time) for each in sources]
-        return _from_table(*one_of_two_tables(*tables, lag_s=options.lag_s), options)
+        return _from_table(*_of_two(tables, options), options)
     refuse(options, ("lag_s",), "is for poses that are matched to images by their times")
     if two:
         if options.units == "mm":
             raise InputError("a pair of text files holds pixels: --units mm does not go with it")
-        unused = "quaternion", "skip_invalid", "ignore_time"
+        unused = "quaternion", "skip_invalid", "ignore_time", "frames"
         refuse(options, unused, "does not go with a pair of text files, poses and points")
         with naming_pose_units(options):
             pair = read_crosswire(
@@ -57,7 +57,8 @@ def from_tables(sources: Sequence[str | os.PathLike[str]], options: ImportOption
             "with poses is needed"
         )
     table = read_rows(sources[0], options, ignore_time=options.ignore_time)
-    return _from_table(table, table.notes, 0, options)
+    table, told = _selected_rows(table, options)
+    return _from_table(table, table.notes + told, 0, options)
 
 
 def _is_pair(sources: Sequence[str | os.PathLike[str]]) -> bool:
@@ -68,6 +69,29 @@ def _is_pair(sources: Sequence[str | os.PathLike[str]]) -> bool:
     width = width_without_header(sources[0])
     # Rows R t may follow a comment that reads like a header.
     return width == 4 or (width in MATRIX_WIDTHS and not of_poses)
+
+
+def _of_two(given: Sequence[PoseTable], options: ImportOptions) -> tuple[PoseTable, list[str], int]:
+    """Poses and points of two tables as one (:func:`one_of_two_tables`), of the selected frames."""
+    tables, told, in_order = [], [], True
+    for table in given:
+        named = table.frame is not None or table.file is not None or table.time is not None
+        # Rows that belong together by their order are selected later: that needs all of them.
+        if named and table.poses is None:
+            in_order = False
+            table, told = _selected_rows(table, options)
+        tables.append(table)
+    table, notes, lost = one_of_two_tables(*tables, lag_s=options.lag_s)
+    if in_order:
+        table, told = _selected_rows(table, options)
+    return table, notes + told, lost
+
+
+def _selected_rows(table: PoseTable, options: ImportOptions) -> tuple[PoseTable, list[str]]:
+    """The rows of a table that are used, by their frames, else by their places; and a note."""
+    numbers = np.array(table.rows) if table.frame is None else table.frame
+    chosen, told = selected(numbers, options, table.name)
+    return (table.of(np.flatnonzero(chosen)) if told else table), told
 
 
 def _from_table(table: PoseTable, notes: list[str], lost: int, options: ImportOptions) -> Imported:

@@ -3,7 +3,7 @@
 One frame is in memory at a time. A frame counts as ``found``; as ``not credible`` if no credible
 target was found in it (the reasons are those of :mod:`jaxcal.data.segmentation.image`); as
 ``not tracked`` if a transform's status was not OK; as ``image not OK`` if the file marks its pixels
-so.
+so; as ``not selected`` if other frames were asked for.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from jaxcal.runtime.messages import command_line
 if TYPE_CHECKING:
     from jaxcal.io.importing.sources import ImportOptions
 
-FATES = ("found", "not credible", "not tracked", "image not OK")
-FOUND, NOT_CREDIBLE, NOT_TRACKED, IMAGE_NOT_OK = range(4)
+FATES = ("found", "not credible", "not tracked", "image not OK", "not selected")
+FOUND, NOT_CREDIBLE, NOT_TRACKED, IMAGE_NOT_OK, NOT_SELECTED = range(5)
 
 
 @dataclass(frozen=True)
@@ -57,13 +57,18 @@ class FrameResults:
         return len(self.fate)
 
     @property
+    def asked(self) -> int:
+        """Number of frames that were asked for."""
+        return int((self.fate != NOT_SELECTED).sum())
+
+    @property
     def found(self) -> Int[np.ndarray, " m"]:
         """Numbers of the frames in which the target was found."""
         return np.flatnonzero(self.fate == FOUND)
 
     def of_tracked(self, tracked: Bool[np.ndarray, " n"]) -> FrameResults:
         """The results where only these frames can be used."""
-        fate = np.where(tracked, self.fate, NOT_TRACKED)
+        fate = np.where(tracked | (self.fate == NOT_SELECTED), self.fate, NOT_TRACKED)
         reason = tuple(why if kept else "" for why, kept in zip(self.reason, tracked, strict=True))
         return replace(self, fate=fate, reason=reason)
 
@@ -84,9 +89,10 @@ class FrameResults:
 def search_target(
     sequence: TrackedSequence,
     tracked: Bool[np.ndarray, " n"],
+    selected: Bool[np.ndarray, " n"],
     options: ImportOptions,
 ) -> FrameResults:
-    """Look for the target in every frame that was tracked.
+    """Look for the target in every selected frame that was tracked.
 
     Raises:
         FormatError: pixels that cannot be read.
@@ -103,6 +109,7 @@ def search_target(
     fate = np.where(
         tracked, np.where(sequence.image_valid, NOT_CREDIBLE, IMAGE_NOT_OK), NOT_TRACKED
     )
+    fate[~selected] = NOT_SELECTED
     reason = [""] * count
     position, covariance = np.full((count, 2), np.nan), np.full((count, 2, 2), np.nan)
     contrast, margin = np.full(count, np.nan), np.full(count, np.nan)

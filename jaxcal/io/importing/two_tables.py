@@ -57,19 +57,12 @@ def one_of_two_tables(
     if lost == len(points):
         raise InputError(f"{points.name}: {poses.name} has the pose of none of its points")
     kept = np.flatnonzero(has_pose)
-    chosen = {
-        name: None if (values := getattr(points, name)) is None else values[kept]
-        for name in ("points", "time", "frame")
-    }
     table = replace(
-        points,
+        points.of(kept),
         name=f"{poses.name} with {points.name}",
-        lines=[points.lines[row] for row in kept],
-        rows=[points.rows[row] for row in kept],
         poses=found[kept],
         velocity=None if velocity is None else velocity[kept],
         length_stated=poses.length_stated,
-        **chosen,
     )
     return table, poses.notes + points.notes + said, lost
 
