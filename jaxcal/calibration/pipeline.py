@@ -88,9 +88,10 @@ def _rigid(poses: Float[Array, "batch n 4 4"]) -> Bool[Array, "batch n"]:
     x, y, z = (poses[..., :3, column] for column in range(3))
     # Axes of length 1 are at right angles, and right-handed, if each is the product of the others.
     off = jnp.stack([jnp.cross(x, y) - z, jnp.cross(y, z) - x, jnp.cross(z, x) - y], axis=-1)
+    last = poses[..., 3, :] - jnp.asarray(LAST_ROW, poses.dtype)
     # Errors of two axes, and that of the third, add up.
     turns = (jnp.abs(off) < 3 * ROTATION_TOLERANCE).all(axis=(-2, -1))
-    return turns & (jnp.abs(poses[..., 3, :] - LAST_ROW) <= LAST_ROW_TOLERANCE).all(axis=-1)
+    return turns & (jnp.abs(last) <= LAST_ROW_TOLERANCE).all(axis=-1)
 
 
 def _solved(
