@@ -253,6 +253,26 @@ def test_what_the_pieces_cannot_take_is_said_in_a_sentence():
                 ("sigma", 2, jnp.ones((3, 3))),
             )
         ),
+        *(
+            (
+                lambda change=change: backend.minimise(
+                    backend.Iterate.of(
+                        jax.tree.map(lambda a: jnp.stack([a, a]), somewhere), backend.RIGID
+                    ),
+                    backend.Points(jnp.ones((3, 2))),
+                    images,
+                    **change,
+                ),
+                said,
+            )
+            for change, said in (
+                ({"damping": -1.0}, "damping must be finite and not negative"),
+                ({"tolerance": -1e-9}, "tolerance must be finite and not negative"),
+                ({"tolerance": np.nan}, "tolerance must be finite and not negative"),
+                ({"max_steps": -1}, "max_steps must be between 1 and"),
+                ({"trace": -1}, "trace must be between 0 and"),
+            )
+        ),
         (
             lambda: backend.channel_residual(somewhere, one),
             "the problem has no times of flight",

@@ -38,9 +38,12 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxcal import InputError
 from jaxcal.model.batch import ImagePlanes, Iterate, barrier, choose
 from jaxcal.model.observations import LocalUnknown, MediumPrior, Observation
+from jaxcal.runtime.arrays import is_traced
+from jaxcal.runtime.given_values import whole_number
 from jaxcal.solvers import dense
 from jaxcal.solvers.batch_loop import until_done
 from jaxcal.solvers.normal_equations import NormalEquations, accumulate
+from jaxcal.solvers.plan import MOST_STEPS, check_size
 
 ACCEPT_RATIO = 1e-4
 """Least ratio of actual to predicted decrease with which a step is taken."""
@@ -374,8 +377,15 @@ def minimise(
         Where it stopped, for every problem.
 
     Raises:
-        InputError: a start or SDs of another number of problems than the data.
+        InputError: a start or SDs of another number of problems than the data; a ``tolerance`` or
+            ``damping`` below zero or no number; ``max_steps`` or ``trace`` that is no whole number.
     """
+    check_size("damping", damping, 0.0, unit="")
+    if tolerance is not None:
+        check_size("tolerance", tolerance, 0.0, unit="")
+    if not is_traced(max_steps):
+        whole_number("max_steps", max_steps, 1, MOST_STEPS)
+    whole_number("trace", trace, 0, MOST_STEPS)
     batch = images.batch_size
     for name, array in (("start", start.point), ("sigma", observation.sigma)):
         if array.ndim != 2 or array.shape[1] != batch:
