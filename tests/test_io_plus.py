@@ -134,7 +134,13 @@ def test_transforms_are_inverted_and_chained_as_plus_does(tmp_path):
         put("Image", "Transducer", np.linalg.inv(moved) @ MATRIX),
         put("Transducer", "Probe", moved),
     )
-    for elements, error_mm in (((OTHER, inverse), 0.5), (chain, None), (chain[::-1], None)):
+    unknown = inverse.replace('Error="0.5"', 'Error="-1"')
+    for elements, error_mm in (
+        ((OTHER, inverse), 0.5),
+        ((OTHER, unknown), None),
+        (chain, None),
+        (chain[::-1], None),
+    ):
         path.write_bytes(configuration(*elements))
         found = read_transform(path)
         np.testing.assert_allclose(found.matrix, MATRIX, rtol=0, atol=1e-12)

@@ -204,6 +204,9 @@ FAR = np.eye(4) + np.eye(4, k=3) * 1e300
         ({"scale_mm_per_px": (1e300, 0.1)}, "scale_mm_per_px holds a number beyond"),
         ({"unknowns": ("translation", "rotation", "nonsense")}, "unknowns must be"),
         ({"image_covariance": np.eye(5)}, r"must have shape \(6, 6\)"),
+        ({"error_mm": -1.0}, "error_mm must not be negative"),
+        ({"probe_frame": 5}, "probe_frame must be text, not 5"),
+        ({"source": 5}, "source must be text, not 5"),
     ],
 )
 @pytest.mark.usefixtures("unchecked")

@@ -72,7 +72,7 @@ def read_transform(
             _check_root(root)
             elements = [each for place in root.all(_COORDINATES) for each in _transforms(place)]
         # All are looked at: a file with a damaged transform is not to be trusted.
-        stated = [(_matrix(e), _frames(e), _optional_number(e, "Error")) for e in elements]
+        stated = [(_matrix(e), _frames(e), _stated_error(e, "Error")) for e in elements]
         pairs = [frames for _, frames, _ in stated]
         ends = {to for start, to in pairs if start == wanted[0]}
         ends = {to for to in ends if not to.startswith("TransducerOrigin")}
@@ -89,7 +89,7 @@ def read_transform(
             total = (np.linalg.inv(check_affine(matrix)) if inverted else matrix) @ total
         if of_result:
             errors = root.first("ErrorReport/ReprojectionError3DStatistics")
-            error_mm = _optional_number(errors, "CalibrationMeanMm")
+            error_mm = _stated_error(errors, "CalibrationMeanMm")
         return PlusTransform(total, error_mm if len(way) == 1 else None, wanted[1])
 
 
@@ -149,10 +149,12 @@ def _numbers(element: Element, name: str, count: int) -> Float[np.ndarray, " cou
     return finite_numbers(_attribute(element, name), count, what)
 
 
-def _optional_number(element: Element | None, name: str) -> float | None:
+def _stated_error(element: Element | None, name: str) -> float | None:
+    """An error, mm; None where there is none, or a negative number in its place."""
     if element is None or name not in element.attributes:
         return None
-    return float(_numbers(element, name, 1)[0])
+    error = float(_numbers(element, name, 1)[0])
+    return error if error >= 0 else None
 
 
 # What is written.

@@ -97,11 +97,12 @@ class ImageTransform:
             mean of the lowest 95 % of its errors.
 
     Raises:
-        InputError: wrong shapes, ``unknowns`` or ``date``; and, unless ``converged`` is False, NaN
-            or Inf, lengths beyond :data:`~jaxcal.data.recording.LARGEST`, a matrix that is not
-            rigid, sizes or a ``range_factor`` or ``tre_factor`` that
-            are not positive, ``degrees_of_freedom`` or a ``variance_factor`` below 1, a covariance
-            that is not symmetric or has negative variances.
+        InputError: wrong shapes, ``unknowns`` or ``date``, a ``source`` or ``probe_frame`` that is
+            no text; and, unless ``converged`` is False, NaN or Inf, lengths beyond
+            :data:`~jaxcal.data.recording.LARGEST`, a matrix that is not rigid, sizes or a
+            ``range_factor`` or ``tre_factor`` that are not positive, a negative ``error_mm``,
+            ``degrees_of_freedom`` or a ``variance_factor`` below 1, a covariance that is not
+            symmetric or has negative variances.
     """
 
     image_plane_to_probe: Float[np.ndarray, "4 4"]
@@ -142,6 +143,9 @@ class ImageTransform:
             "image_covariance": (size, size),
             "error_mm": (),
         }
+        for name in ("source", "probe_frame"):
+            if not isinstance(getattr(self, name), str):
+                raise InputError(f"{name} must be text, not {shown(getattr(self, name))}")
         if self.converged is not None:
             check_flag("converged", self.converged)
         if self.date is not None:
@@ -448,6 +452,8 @@ def _checked(values: dict[str, np.ndarray]) -> Float[np.ndarray, "4 4"]:
             raise InputError(f"{name} holds a number beyond {LARGEST:g}: that cannot be a measure")
         if name in ("scale_mm_per_px", "range_factor", "tre_factor") and not (array > 0).all():
             raise InputError(f"{name} must be positive")
+        if name == "error_mm" and array < 0:
+            raise InputError("error_mm must not be negative")
         if name in ("degrees_of_freedom", "variance_factor") and array < 1:
             raise InputError(f"{name} must be at least 1")
         if name in ("covariance", "image_covariance") and (np.diag(array) < 0).any():
