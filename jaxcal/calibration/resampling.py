@@ -105,8 +105,11 @@ class Bootstrap(eqx.Module):
         image_to_probe: (k, 4, 4) X of each resample.
         converged: (k,) whether the resample has at least four different images, as every
             calibration needs, and its solve converged; the following use only those.
-        spread: (6,) SD of X about the X of all images, [v, omega], mm and rad. It is computed from
-            medians, so a few resamples with too few different images do not spoil it.
+        spread: (6,) robust scale of X about the X of all images, [v, omega], mm and rad: 1.4826
+            times the median magnitude of each component of the moves. It is their SD where they are
+            Gaussian and scatter about the X of all images; with heavier tails it is smaller than
+            the SD, so a few resamples that hardly determine X do not spoil it. A move that most
+            resamples share counts, too.
         reproducibility: (m,) mean distance of an image point from its mean over the resamples, mm,
             estimated pixel sizes, sound speed and delay included.
         rms_scatter: (m,) root mean square of the same distances, mm.
