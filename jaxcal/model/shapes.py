@@ -17,6 +17,14 @@ is the inner loop of the whole estimator, so it is written for XLA to make a sin
 of it: one reduction over the interval's two halves, with so few nodes that the compiler unrolls
 them.
 
+Student's law has no edges that cut the interval, so its nodes spread with the Gaussian's SD, and 16
+of them are too far apart for its peak where the Gaussian is wide. At a Gaussian's SD of 1, 1.5, 2
+and 3 SDs of the law, its variance is off by up to 0.08 %, 1.5 %, 8 % and 43 %; that of the laws
+with edges by less than 1 % at every width. The Gaussian is that wide only where few images leave
+small offsets unknown, and answers hardly change there: with 60 nodes instead of 16, X of 192
+simulated problems of 8 images (offsets of 0.03 to 1 mm by three laws, noise of 0.5 mm) moves by at
+most 0.05 SDs, and its SDs change by at most 4 %. With 20 images it is 0.002 SDs and 0.2 %.
+
 Reference for the corrections: Hildebrand, Introduction to Numerical Analysis, 5.9.
 """
 
