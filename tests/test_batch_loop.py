@@ -16,7 +16,7 @@ from jaxcal.model.batch import ImagePlanes, Iterate
 from jaxcal.model.observations import OwnCovariances
 from jaxcal.model.unknowns import RIGID
 from jaxcal.solvers import batch_loop
-from jaxcal.solvers.batch_loop import FEW, LARGE_BATCH, until_done
+from jaxcal.solvers.batch_loop import LARGE_BATCH, PROBLEMS_PER_STRAGGLER, until_done
 from jaxcal.solvers.levenberg_marquardt import Minimum, minimise
 from jaxcal.solvers.start import closed_form
 
@@ -32,7 +32,7 @@ class Halving(eqx.Module):
 def test_the_last_problems_go_on_alone():
     draws = np.random.default_rng(20261126)
     begun = draws.uniform(1, 10, LARGE_BATCH)
-    hard = draws.choice(LARGE_BATCH, LARGE_BATCH // FEW // 2, replace=False)
+    hard = draws.choice(LARGE_BATCH, LARGE_BATCH // PROBLEMS_PER_STRAGGLER // 2, replace=False)
     begun[hard] *= 2.0 ** draws.integers(20, 60, len(hard))
     begun[-1] *= 2.0**70
     widths = []
@@ -49,7 +49,7 @@ def test_the_last_problems_go_on_alone():
     np.testing.assert_array_equal(found.passes, passes)
     np.testing.assert_allclose(found.value, begun * shares[:, 0] ** passes, rtol=1e-12)
     assert not found.active.any()
-    assert {*widths} == {LARGE_BATCH, LARGE_BATCH // FEW}
+    assert {*widths} == {LARGE_BATCH, LARGE_BATCH // PROBLEMS_PER_STRAGGLER}
 
 
 def test_a_solver_does_not_notice(monkeypatch):

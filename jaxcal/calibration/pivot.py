@@ -34,7 +34,7 @@ from jaxcal.diagnostics.uncertainty import LARGEST_SD, Spectra
 from jaxcal.model.outlying import stands_out
 from jaxcal.model.parameters import Parameters, retract
 from jaxcal.model.residuals import target_in_image
-from jaxcal.model.thresholds import FEWEST_IMAGES
+from jaxcal.model.thresholds import FEWEST_TO_LEAVE_OUT
 from jaxcal.result.calibration import OneOrBatch, Status, check_one, status_names
 from jaxcal.runtime import compiler, executables
 from jaxcal.runtime.array_types import AnyArray
@@ -344,7 +344,7 @@ def _solve(poses: Float[Array, "n 4 4"], mask: Float[Array, " n"], *, robust: bo
     studentised = studentised_errors(parameters, everything, keep, model)
     outlier = mask * (1 - keep)
     if not robust:
-        judged = jnp.sum(mask) >= FEWEST_IMAGES
+        judged = jnp.sum(mask) >= FEWEST_TO_LEAVE_OUT
         outlier = mask * judged * stands_out(studentised, keep)
     used = jnp.sum(keep)
     variance = jnp.sum(residual**2) / jnp.maximum(3 * used - 6, 1.0)

@@ -36,8 +36,8 @@ from jaxcal.diagnostics.image_errors import (
 )
 from jaxcal.diagnostics.sd_by_place import relative_sd
 from jaxcal.diagnostics.uncertainty import Uncertainty, inverses
-from jaxcal.model.outlying import LEAST_LEFT, robust_sd, stands_out, studentise
-from jaxcal.model.thresholds import FEWEST_IMAGES
+from jaxcal.model.outlying import LEAST_ERROR_LEFT, robust_sd, stands_out, studentise
+from jaxcal.model.thresholds import FEWEST_TO_LEAVE_OUT
 from jaxcal.model.unknowns import block_slice, further_derivatives, measured
 from jaxcal.result.calibration import Calibration
 from jaxcal.result.diagnostics import ADDITIONS, Inspection
@@ -79,14 +79,14 @@ def inspect(
     if answer.robust:
         outlier = seen.mask * (1 - kept)
     else:
-        judged = (seen.mask.sum(axis=1) >= FEWEST_IMAGES) & np.isfinite(studentised).all(
+        judged = (seen.mask.sum(axis=1) >= FEWEST_TO_LEAVE_OUT) & np.isfinite(studentised).all(
             axis=(1, 2)
         )
         outlier = seen.mask * judged[:, None] * stands_out(studentised, kept)
     residual = seen.errors
     if tuned:
         whitened = Whitened.of(answer, shifted)
-        left = np.maximum(1 - whitened.leverage(uncertainty.inverse), LEAST_LEFT)
+        left = np.maximum(1 - whitened.leverage(uncertainty.inverse), LEAST_ERROR_LEFT)
         residual = whitened.errors / np.sqrt(left)
     kurtosis, misfit = check_noise_model(residual, seen.distance, kept)
     gain = gains(answer, seen, uncertainty)

@@ -38,7 +38,7 @@ from jaxcal.solvers.plan import DEFAULT_MAX_ELEVATION_MM, TUNED
 
 Array = np.ndarray
 
-SINGULAR = 1e-11
+SINGULAR_DESIGN = 1e-11
 """Smallest eigenvalue over the trace of the unweighted design below which poses are degenerate."""
 
 LARGEST_SD = 0.5
@@ -221,7 +221,7 @@ def covariance_by_axis(
 
 def threshold(eps: float) -> float:
     """Smallest eigenvalue over the trace below which a matrix counts as singular."""
-    return max(SINGULAR, 100 * eps)
+    return max(SINGULAR_DESIGN, 100 * eps)
 
 
 def mm_at_target(lever: Float[AnyArray, "*batch"], blocks: Blocks) -> Any:

@@ -16,11 +16,11 @@ GROSS_SHARE = 0.02
 """No component's SD is taken to be less than this share of the largest: smaller errors are no
 gross ones."""
 
-LEAST_LEFT = 0.05
+LEAST_ERROR_LEFT = 0.05
 """Least share of an image's error that a fit is taken to leave in its residual (1 - leverage)."""
 
 
-def with_floor(sigma: Float[AnyArray, "*batch 3"]) -> Float[HeldArray, "*batch 3"]:
+def with_gross_floor(sigma: Float[AnyArray, "*batch 3"]) -> Float[HeldArray, "*batch 3"]:
     """The components' SDs, mm, none below its floor."""
     xp = array_module(sigma)
     return xp.maximum(sigma, xp.maximum(GROSS_SHARE * xp.max(sigma, -1, keepdims=True), 1e-6))
@@ -38,7 +38,7 @@ def robust_sd(
     """
     xp = array_module(medians, count)
     freedom = xp.maximum(1 - unknowns / (3 * count), 0.1)
-    return with_floor(MAD * medians / xp.sqrt(freedom)[..., None])
+    return with_gross_floor(MAD * medians / xp.sqrt(freedom)[..., None])
 
 
 def studentise(
@@ -52,7 +52,7 @@ def studentise(
     An image in use pulls the fit towards itself; the fit predicts an image that is not in use.
     """
     xp = array_module(errors, leverage, sigma, kept)
-    left = xp.where(kept[..., None] > 0, xp.maximum(1 - leverage, LEAST_LEFT), 1 + leverage)
+    left = xp.where(kept[..., None] > 0, xp.maximum(1 - leverage, LEAST_ERROR_LEFT), 1 + leverage)
     return errors / xp.sqrt(left) / sigma[..., None, :]
 
 

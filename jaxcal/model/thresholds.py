@@ -8,7 +8,7 @@ LARGEST_ELEVATION = 0.95
 MINIMUM_SELF_TUNING = 8
 """With fewer used images the residuals cannot determine three SDs besides nine unknowns."""
 
-FEWEST_IMAGES = 8
+FEWEST_TO_LEAVE_OUT = 8
 """With fewer used images nothing is left out: they cannot outvote one another."""
 
 MAD = 1.4826

@@ -21,7 +21,7 @@ LARGE_BATCH = 4096
 """Batches of fewer problems stay whole, since the second loop has to be compiled, too. A CPU solves
 far fewer side by side."""
 
-FEW = 16
+PROBLEMS_PER_STRAGGLER = 16
 """At most one problem in so many goes on alone. On an H100, a pass over a sixteenth of 65,536
 problems of 20 images takes little longer than one over a single problem."""
 
@@ -50,7 +50,7 @@ def until_done(
         return lambda state: jnp.sum(active(state)) > few
 
     batch = jax.eval_shape(active, state).shape[0]
-    few = batch // FEW if batch >= LARGE_BATCH and not together else 0
+    few = batch // PROBLEMS_PER_STRAGGLER if batch >= LARGE_BATCH and not together else 0
     state = jax.lax.while_loop(more_than(few), lambda state: step(state, data), state)
     if not few:
         return state

@@ -39,10 +39,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxcal.data.problem import Problem
-from jaxcal.model.outlying import robust_sd, stands_out, studentise, with_floor
+from jaxcal.model.outlying import robust_sd, stands_out, studentise, with_gross_floor
 from jaxcal.model.parameters import Parameters, retract
 from jaxcal.model.residuals import measured_points, measurement_residual
-from jaxcal.model.thresholds import FEWEST_IMAGES
+from jaxcal.model.thresholds import FEWEST_TO_LEAVE_OUT
 from jaxcal.model.unknowns import Blocks, count_unknowns
 from jaxcal.runtime.jax_modes import in_standard_promotion
 from jaxcal.solvers import dense
@@ -125,7 +125,7 @@ def find_consensus(problem: Problem, model: ConsensusModel) -> Float[Array, " n"
         jax.tree.map(lambda leaf: leaf[chosen], proposed), subsets[chosen], everything
     )
     winner = jnp.argmin(cost)
-    enough = (jnp.sum(used) >= FEWEST_IMAGES) & jnp.isfinite(cost[winner])
+    enough = (jnp.sum(used) >= FEWEST_TO_LEAVE_OUT) & jnp.isfinite(cost[winner])
     return jnp.where(enough, keep[winner], used)
 
 
@@ -139,7 +139,7 @@ def _finish(
     """Fit the subset, concentrate and reject; the images to keep, and the cost of keeping them."""
     used = problem.mask
     # Less than half of the images are no consensus.
-    fewest = jnp.maximum(0.5 * jnp.sum(used), FEWEST_IMAGES)
+    fewest = jnp.maximum(0.5 * jnp.sum(used), FEWEST_TO_LEAVE_OUT)
 
     def one_round(index: Array, state: tuple[Parameters, Array]) -> tuple[Parameters, Array]:
         parameters, weight = state
@@ -220,7 +220,7 @@ def _efficient(
     if model.isotropic:
         squares, freedom = jnp.full(3, jnp.mean(squares)), jnp.full(3, jnp.mean(freedom))
     freedom = jnp.maximum(freedom, 0.1 * jnp.sum(weight))
-    return with_floor(jnp.sqrt(squares / freedom)), freedom
+    return with_gross_floor(jnp.sqrt(squares / freedom)), freedom
 
 
 def linearise(

@@ -60,7 +60,7 @@ LAGS = 5
 BARTLETT = tuple(1 - lag / (LAGS + 1) for lag in range(LAGS + 1))
 """Bartlett's weights of these lags, from 0 on."""
 
-LEAST_LEFT = 0.05
+LEAST_INFORMATION_LEFT = 0.05
 """Least share of the information about b assumed to be left without an image and its neighbours."""
 
 
@@ -189,7 +189,7 @@ def trust_in(
 
     weights, shares = jnp.asarray(BARTLETT, share.dtype), around(share)
     near = jax.lax.fori_loop(1, LAGS + 1, add_neighbours, share)
-    moved = moved / jnp.maximum(1 - near, LEAST_LEFT)
+    moved = moved / jnp.maximum(1 - near, LEAST_INFORMATION_LEFT)
     moves = around(moved)
     shown = jax.lax.fori_loop(1, LAGS + 1, add_products, jnp.sum(moved**2, axis=1))
     return variance / jnp.maximum(variance, shown)

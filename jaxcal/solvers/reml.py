@@ -69,7 +69,7 @@ ABSOLUTE_FLOOR_MM = 1e-6
 LEAST_FREEDOM = 0.05
 """Least degrees of freedom of a component, as a share of its residuals."""
 
-EXACT_BELOW = 0.03
+EXACT_TUNING_BELOW = 0.03
 """Gradient cosine below which exact second derivatives are used."""
 
 UPDATES = 3
@@ -81,7 +81,7 @@ def least_sigma(sigma: Float[Array, " components ..."]) -> Float[Array, " ..."]:
     return jnp.maximum(RELATIVE_FLOOR * jnp.max(sigma, axis=0), ABSOLUTE_FLOOR_MM)
 
 
-def with_floor(sigma: Float[Array, " components ..."]) -> Float[Array, " components ..."]:
+def with_least_sigma(sigma: Float[Array, " components ..."]) -> Float[Array, " components ..."]:
     """The SDs, none below a thousandth of the largest."""
     return jnp.maximum(sigma, least_sigma(sigma))
 
@@ -168,7 +168,7 @@ def updated(
     leverage = traces(inverse, sums.matrix)
     bent = traces(move[:, None] * move, sums.matrix)
     left = sums.squares + 2 * jnp.sum(sums.gradient * move, axis=1) + bent
-    return with_floor(helmert(left, leverage, count, sigma))
+    return with_least_sigma(helmert(left, leverage, count, sigma))
 
 
 class Tuning(eqx.Module):
@@ -237,7 +237,7 @@ class Tuning(eqx.Module):
         sums = barrier(
             component_sums(state.candidate, observed, self.images, state.proposed, self.medium)
         )
-        crude = with_floor(jnp.sqrt(sums.squares / self.count))
+        crude = with_least_sigma(jnp.sqrt(sums.squares / self.count))
         crude = jnp.where(self.enough, crude, self.fallback)
         proposed = jnp.where(state.iterations == 0, crude, state.proposed)
         normal = sums.weighted(1 / proposed**2)
@@ -259,7 +259,7 @@ class Tuning(eqx.Module):
             )
         )
         # Where the candidate is refused, the proposal from its sums is not used.
-        exact = jnp.where(cosine <= EXACT_BELOW, 1.0, 0.0).astype(self.coordinates.dtype)
+        exact = jnp.where(cosine <= EXACT_TUNING_BELOW, 1.0, 0.0).astype(self.coordinates.dtype)
         found = self.propose(sums, sigma, damping, exact)
         change = jnp.max(jnp.abs(jnp.log(found.updated / sigma)), axis=0)
         change = jnp.where(accept, change, state.change)

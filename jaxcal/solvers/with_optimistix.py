@@ -21,7 +21,7 @@ from jaxcal.runtime.compiler import traced_once
 from jaxcal.solvers.levenberg_marquardt import Minimum, Rounding, empty_trace, gradient_cosine
 from jaxcal.solvers.normal_equations import accumulate, component_sums, weight_of
 from jaxcal.solvers.plan import Options
-from jaxcal.solvers.reml import sigma_tolerance, update_at, with_floor
+from jaxcal.solvers.reml import sigma_tolerance, update_at, with_least_sigma
 
 MOST_UPDATES = 60
 """Most updates of the SDs."""
@@ -127,7 +127,7 @@ def self_tuned_with(
     """Weighted solves of one problem, with Helmert's updates between them until the SDs stay."""
     enough, tolerance = images.used >= MINIMUM_SELF_TUNING, sigma_tolerance(images.mask.dtype)
     squares = component_sums(start, observation, images, None, medium).squares
-    crude = with_floor(jnp.sqrt(squares / observation.count(images)))
+    crude = with_least_sigma(jnp.sqrt(squares / observation.count(images)))
     first = jnp.where(enough, crude, observation.sigma)
 
     def solve(iterate: Iterate, sigma: Array) -> Fit:

@@ -42,7 +42,7 @@ from jaxcal.solvers.closed_form.reduced_objective import (
     CONSTRAINTS,
     NEARBY,
     ROUNDING,
-    SINGULAR,
+    SINGULAR_SYSTEM,
     TOLERANCE,
     QuadraticConstraints,
     check_estimate,
@@ -52,7 +52,7 @@ from jaxcal.solvers.closed_form.single import ClosedForm, solve_problem
 CHUNK = 256
 """Problems in one call of the compiled program."""
 
-FEW = 1024
+MOST_ONE_BY_ONE = 1024
 """Up to so many problems are solved one by one, in about a second; compiling takes six."""
 
 NEWTON_STEPS = 30
@@ -63,7 +63,9 @@ SHORTER = 0.25
 """Factor on a step that was no better."""
 
 
-def solve_batch(problems: Problem, estimate: tuple[str, ...], *, few: int = FEW) -> ClosedForm:
+def solve_batch(
+    problems: Problem, estimate: tuple[str, ...], *, few: int = MOST_ONE_BY_ONE
+) -> ClosedForm:
     """Conventional calibrations of problems with any leading axes, concrete or traced.
 
     Args:
@@ -161,7 +163,7 @@ def solve_traceable(problems: Problem, estimate: tuple[str, ...]) -> ClosedForm:
     x = _feasible(x, constraints)
     gap, least, definite = _gap(constraints, matrix, vector, x, values)
     # Sums from singular normal equations of t prove nothing.
-    definite = definite & (reduced.smallest_pivot > SINGULAR)
+    definite = definite & (reduced.smallest_pivot > SINGULAR_SYSTEM)
 
     of_mean, target = reduced.origin_and_target(x)
     scaled = constraints.scaled
@@ -346,4 +348,4 @@ def _gap(
     half = unrolled.forward(factor, pivots, rest)
     largest = sum(matrix[i, i] for i in range(6))
     least = 1 / jnp.max(jnp.stack(pivots), axis=0) ** 2
-    return unrolled.dot(half, half), least, least > SINGULAR * largest
+    return unrolled.dot(half, half), least, least > SINGULAR_SYSTEM * largest

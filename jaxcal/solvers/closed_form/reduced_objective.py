@@ -57,7 +57,7 @@ SHIFTS = (0.0, 1e-15, 1e-14, 1e-12, 1e-9, 1e-6, 1e-4, 1e-2)
 NEARBY = 0.01
 """Answers that differ by less than this share of x are the same one."""
 
-SINGULAR = 1e-11
+SINGULAR_SYSTEM = 1e-11
 """M is called singular where its least eigenvalue is below this share of C'C's largest."""
 
 
@@ -330,7 +330,7 @@ def duality_gap(
 def unconstrained_gap(reduced: ReducedObjective, x: Float[np.ndarray, " 6"]) -> float:
     """f(x) less its minimum without any constraint; this bound holds for a singular C as well."""
     left, values, _ = np.linalg.svd(reduced.factor)
-    within = left[:, values > SINGULAR * max(values[0], np.finfo(float).tiny)]
+    within = left[:, values > SINGULAR_SYSTEM * max(values[0], np.finfo(float).tiny)]
     return float(np.sum((within.T @ (reduced.factor @ x + reduced.shift)) ** 2))
 
 
@@ -411,7 +411,7 @@ def _is_unique(
     added = np.tensordot(values, reduced.constraints.matrices, 1)
     squared = reduced.factor.T @ reduced.factor
     least = np.linalg.eigvalsh(squared + added)[0]
-    if not least > SINGULAR * np.linalg.norm(squared, 2):
+    if not least > SINGULAR_SYSTEM * np.linalg.norm(squared, 2):
         return False
     above = duality_gap(reduced, x, values) + excess + reduced.resolution
     return bool(4 * above <= (NEARBY * np.linalg.norm(x)) ** 2 * least)
