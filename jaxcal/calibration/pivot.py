@@ -43,6 +43,7 @@ from jaxcal.runtime.given_values import check_flag, real_array, truth_array
 from jaxcal.runtime.jax_modes import in_own_modes, inside_transformation, require_float64
 from jaxcal.solvers import dense
 from jaxcal.solvers.consensus import ConsensusModel, find_consensus, linearise, studentised_errors
+from jaxcal.solvers.proposals import subset_systems
 
 BLOCKS = ("translation", "point")
 AXES = ("x", "y", "z")
@@ -398,9 +399,6 @@ def _proposals(problem: Problem, subsets: Float[Array, "k n"]) -> Parameters:
     centre = jnp.sum(used[:, None] * translations, axis=0) / jnp.sum(used)
     eye = jnp.broadcast_to(jnp.eye(3, dtype=used.dtype), rotations.shape)
     rows = jnp.concatenate([rotations, -eye, (centre - translations)[..., None]], axis=2)
-    rows = jnp.where(used[:, None, None] > 0, rows, 0.0)
-    moments = jnp.einsum("nia,nib->nab", rows, rows).reshape(len(used), -1)
-    systems = (subsets @ moments).reshape(-1, 7, 7)
 
     def solve(system: Float[Array, "7 7"]) -> Parameters:
         matrix, vector = system[:6, :6], system[:6, 6:]
@@ -408,4 +406,4 @@ def _proposals(problem: Problem, subsets: Float[Array, "k n"]) -> Parameters:
         found = dense.solve_positive(matrix + ridge * jnp.eye(6, dtype=matrix.dtype), vector)[:, 0]
         return Parameters.of(jnp.eye(3, dtype=found.dtype), found[:3], found[3:] + centre)
 
-    return jax.vmap(solve)(systems)
+    return jax.vmap(solve)(subset_systems(rows, used, subsets))

@@ -47,6 +47,21 @@ def subset_weights(used: Float[Array, " n"], size: int) -> Float[Array, "k n"]:
     return chosen * used
 
 
+def subset_systems(
+    rows: Float[Array, "n 3 p"], used: Float[Array, " n"], subsets: Float[Array, "k n"]
+) -> Float[Array, "k p p"]:
+    """Normal equations of every subset, as the sums of its images' moments.
+
+    Args:
+        rows: of every image's linear equations, the right-hand side as the last column.
+        used: 1 for used images; the rows of the others may hold anything.
+        subsets: weights of the images.
+    """
+    rows = jnp.where(used[:, None, None] > 0, rows, 0.0)
+    moments = jnp.einsum("nia,nib->nab", rows, rows).reshape(len(used), -1)
+    return (subsets @ moments).reshape(-1, rows.shape[2], rows.shape[2])
+
+
 def linear_proposals(
     problem: Problem, subsets: Float[Array, "k n"], *, blocks: Blocks
 ) -> Parameters:
@@ -82,10 +97,8 @@ def linear_proposals(
         ],
         axis=2,
     )
-    rows = jnp.where(used[:, None, None] > 0, rows, 0.0)
     # In units of the points' spread all 12 unknowns and all moments are of order one.
-    moments = jnp.einsum("nia,nib->nab", rows, rows).reshape(len(used), -1)
-    systems = (subsets @ moments).reshape(-1, 13, 13)
+    systems = subset_systems(rows, used, subsets)
 
     def solve(system: Float[Array, "13 13"]) -> Parameters:
         ridge = 1e3 * jnp.finfo(system.dtype).eps * jnp.trace(system) / 13
