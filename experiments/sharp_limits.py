@@ -20,7 +20,7 @@ from common import arguments, experiments, machine, rms, show, write_table
 
 import jaxcal
 from jaxcal.data.recording import Recording, make_images
-from jaxcal.model.image_points import distance
+from jaxcal.model.image_points import rms_distance
 from jaxcal.report.accuracy import FAIR_MM, region_of
 from jaxcal.report.record import calibration_record
 from jaxcal.runtime.jax_cache import enable_compilation_cache
@@ -45,8 +45,7 @@ def judged(result, gaussian, recording: Recording, x: np.ndarray) -> list[float]
     record = calibration_record(result, recording)
     grid = region_of(result, recording).grid()[:, [0, 2]]
     error, other = (
-        distance(np.asarray(each.image_to_probe), x, np.ones(2), grid, 0.0)
-        for each in (result, gaussian)
+        rms_distance(np.asarray(each.image_to_probe), x, grid) for each in (result, gaussian)
     )
     tre = record["tre"]
     if tre is None or tre["stated_mm"] is None:

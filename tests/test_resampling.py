@@ -31,7 +31,7 @@ from jaxcal.cli.main import main
 from jaxcal.data.sound import WATER_M_S
 from jaxcal.diagnostics import metrics
 from jaxcal.model.distributions import FAMILIES, OffsetLaw
-from jaxcal.model.image_points import distance
+from jaxcal.model.image_points import rms_distance, stretched
 from jaxcal.result.calibration import Medium
 from jaxcal.runtime.arrays import map_arrays
 
@@ -196,7 +196,8 @@ def test_a_pixel_has_other_places_in_the_images_of_other_calibrations(data):
     stretch = np.asarray(other.scale_mm_per_px) / np.asarray(whole.scale_mm_per_px)
     away = other.apply(ends).points - whole.apply(ends).points
     apart = np.sqrt(np.mean(np.sum(away**2, axis=1)))
-    assert distance(first, second, stretch, places[[0, 2]].T, 4.0) == pytest.approx(apart, rel=1e-9)
+    second = stretched(second, *stretch, (1 - stretch[1]) * 4.0)
+    assert rms_distance(second, first, places[[0, 2]].T) == pytest.approx(apart, rel=1e-9)
 
 
 def test_log_density_has_the_trackers_errors_in_it(data, whole):

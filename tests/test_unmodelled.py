@@ -17,7 +17,7 @@ from jaxcal.data.recording import Recording, make_images
 from jaxcal.diagnostics.misfits import misfits
 from jaxcal.diagnostics.serial_errors import correlation, independent
 from jaxcal.diagnostics.unmodelled import likelihood_ratio, unmodelled
-from jaxcal.model.image_points import distance
+from jaxcal.model.image_points import rms_distance
 from jaxcal.report.accuracy import region_of
 from jaxcal.report.record import calibration_record
 from jaxcal.report.verdict import advice, verdict
@@ -485,7 +485,7 @@ def test_a_bound_that_moves_the_answer_is_told_of(bound, least, most):
         grid = region_of(result.numpy(), recording).grid()[:, [0, 2]]
         without = jaxcal.calibrate(recording, prior="gaussian").image_to_probe
         mine, none = (np.asarray(x) for x in (result.image_to_probe, without))
-        apart = distance(mine, none, np.ones(2), grid, 0.0)
+        apart = rms_distance(mine, none, grid)
         moved = tre["gaussian_offsets"]["apart_mm"]
         assert moved == pytest.approx(apart, rel=0.1)
         said = [words for words in tre["contradictions"] if "Gaussian offsets differs" in words]
@@ -508,7 +508,7 @@ def test_uniform_offsets_that_are_not_uniform_are_told_of(law):
         tre = calibration_record(result, recording)["tre"]
         grid = region_of(result.numpy(), recording).grid()[:, [0, 2]]
         mine, true = np.asarray(result.image_to_probe), recording.truth.image_to_probe
-        error = distance(mine, true, np.ones(2), grid, 0.0)
+        error = rms_distance(mine, true, grid)
         told = any("Gaussian offsets differs" in words for words in tre["contradictions"])
         found += told
         assert told or error < tre["stated_interval_mm"][1]

@@ -32,6 +32,7 @@ from jaxcal.data.recording import MINIMUM_IMAGES, Images, Recording
 from jaxcal.diagnostics.image_errors import noise_covariance
 from jaxcal.diagnostics.intervals import range_of_row_zero
 from jaxcal.diagnostics.metrics import distance_from_mean, reconstruct, rms_from_mean
+from jaxcal.model.image_points import rms_distance, stretched
 from jaxcal.model.thresholds import MAD
 from jaxcal.model.unknowns import measured, split_further, unknown_names
 from jaxcal.result.calibration import Calibration
@@ -197,7 +198,7 @@ def _compared(
     whole = result.image_to_probe
     moved = mask[:, None] * relative_twist(whole, held.image_to_probe)
     points = _box_points(problem, result)
-    image_moved = _rms_distance(_from_full_image(held, result, problem), whole, points) * mask
+    image_moved = rms_distance(_from_full_image(held, result, problem), whole, points) * mask
     noise = noise_covariance(fits, problem)[fold, np.arange(len(fold))]
     return CrossValidation(
         residual=errors,
@@ -388,25 +389,7 @@ def _from_full_image(
     if fits.scale_mm_per_px is not None and result.scale_mm_per_px is not None:
         ratio = fits.scale_mm_per_px / result.scale_mm_per_px
         lateral, axial = ratio[:, 0], axial * ratio[:, 1]
-    x = fits.image_to_probe
-    # Columns of the rotation are stretched; the last column is the translation.
-    stretch = xp.stack([lateral, xp.ones_like(axial), axial, xp.ones_like(axial)], axis=1)
-    shift = (origins - axial * origin)[:, None] * x[:, :, 2]
-    last = xp.asarray([0.0, 0.0, 0.0, 1.0])
-    return x * stretch[:, None] + shift[..., None] * last
-
-
-def _rms_distance(
-    transforms: Float[AnyArray, "k 4 4"],
-    whole: Float[AnyArray, "4 4"],
-    points: Float[AnyArray, "m 2"],
-) -> Float[AnyArray, " k"]:
-    """Root mean square distance of image points under each transform from those under ``whole``."""
-    xp = array_module(transforms, whole, points)
-    zero, one = xp.zeros_like(points[:, 0]), xp.ones_like(points[:, 0])
-    there = xp.stack([points[:, 0], zero, points[:, 1], one])
-    moved = ((transforms - whole) @ there)[:, :3]
-    return xp.sqrt(xp.mean(xp.sum(moved**2, axis=1), axis=1))
+    return stretched(fits.image_to_probe, lateral, axial, origins - axial * origin)
 
 
 def _full_calibration(

@@ -15,7 +15,7 @@ import numpy as np
 from jaxcal import InputError
 from jaxcal.data.problem import Problem
 from jaxcal.diagnostics.image_errors import ImageErrors
-from jaxcal.model.image_points import distance
+from jaxcal.model.image_points import rms_distance, stretched
 from jaxcal.model.unknowns import RIGID
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Float
@@ -96,7 +96,9 @@ def apart_in_image(
     """
     stretch = _pixel_size(second, problem) / _pixel_size(first, problem)
     x, other = np.asarray(first.image_to_probe), np.asarray(second.image_to_probe)
-    return distance(x, other, stretch, grid, float(np.asarray(problem.face_offset)))
+    # Pixel sizes do not stretch the range of row 0.
+    shift = (1 - stretch[1]) * np.asarray(problem.face_offset, float)
+    return float(rms_distance(stretched(other, *stretch, shift), x, grid))
 
 
 def _pixel_size(found: ClosedForm | Calibration, problem: Problem) -> Float[np.ndarray, " 2"]:

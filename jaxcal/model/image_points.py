@@ -12,13 +12,13 @@ needs the covariance of all these unknowns, not of X alone.
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
 
 from jaxcal.model.unknowns import TABLE, Blocks
 from jaxcal.runtime.array_types import AnyArray, Float
+from jaxcal.runtime.arrays import array_module
 
 
 def point_jacobian(
@@ -62,25 +62,45 @@ def mean_of_squares(jacobian: Float[AnyArray, "*batch m 3 p"]) -> Float[np.ndarr
     return np.einsum("...mia,...mib->...ab", jacobian, jacobian) / jacobian.shape[-3]
 
 
-def distance(
-    first: Float[np.ndarray, "4 4"],
-    second: Float[np.ndarray, "4 4"],
-    stretch: Float[np.ndarray, " 2"],
-    grid: Float[np.ndarray, "m 2"],
-    face_mm: float,
-) -> float:
-    """How far apart two X put image points, root mean square, mm.
+def stretched(
+    transforms: Float[AnyArray, "*k 4 4"],
+    lateral: Float[Any, "*k"],
+    axial: Float[Any, "*k"],
+    shift: Float[Any, "*k"],
+) -> Float[AnyArray, "*k 4 4"]:
+    """Transforms of the points (lateral x, axial z + shift) of an image, as transforms of (x, z).
+
+    Another size of a pixel, another sound speed or another delay moves points of an image so.
 
     Args:
-        first: image to probe.
-        second: another one.
-        stretch: size of the second image's pixels over that of the first's, [lateral, axial].
-        grid: [lateral, axial] of the points in the first image, mm.
-        face_mm: range of pixel row 0.
+        transforms: image to probe, mm.
+        lateral: factor on lateral positions.
+        axial: factor on axial positions.
+        shift: of axial positions, mm.
     """
-    zero, one = np.zeros(len(grid)), np.ones(len(grid))
-    there = np.stack([grid[:, 0], zero, grid[:, 1], one])
-    axial = face_mm + stretch[1] * (grid[:, 1] - face_mm)
-    other = np.stack([stretch[0] * grid[:, 0], zero, axial, one])
-    moved = (second @ other - first @ there)[:3]
-    return math.sqrt(float(np.mean(np.sum(moved**2, axis=0))))
+    xp = array_module(transforms, lateral, axial, shift)
+    one = xp.ones_like(axial)
+    # Columns of the rotation are stretched; the last column is the translation.
+    stretch = xp.stack([lateral, one, axial, one], axis=-1)
+    moved = shift[..., None] * transforms[..., :, 2]
+    last = xp.asarray([0.0, 0.0, 0.0, 1.0])
+    return transforms * stretch[..., None, :] + moved[..., None] * last
+
+
+def rms_distance(
+    transforms: Float[AnyArray, "*k 4 4"],
+    whole: Float[AnyArray, "4 4"],
+    points: Float[AnyArray, "m 2"],
+) -> Float[AnyArray, "*k"]:
+    """Root mean square distance of image points under each transform from those under ``whole``.
+
+    Args:
+        transforms: image to probe, mm.
+        whole: the one to compare them with.
+        points: [lateral, axial], mm.
+    """
+    xp = array_module(transforms, whole, points)
+    zero, one = xp.zeros_like(points[:, 0]), xp.ones_like(points[:, 0])
+    there = xp.stack([points[:, 0], zero, points[:, 1], one])
+    moved = ((transforms - whole) @ there)[..., :3, :]
+    return xp.asarray(xp.sqrt(xp.mean(xp.sum(moved**2, axis=-2), axis=-1)))
