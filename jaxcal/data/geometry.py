@@ -63,6 +63,33 @@ def orthonormal_pair(
     return half * (plus + minus), half * (plus - minus)
 
 
+def origin_from_mean(
+    of_mean: Float[Array, "3 ..."],
+    mean: Float[Array, "2 ..."],
+    lateral: Float[Array, "3 ..."],
+    axial: Float[Array, "3 ..."],
+    scale: Float[Array, "2 ..."],
+    face: Float[Array, " ..."],
+    moved_face: Float[Array, " ..."],
+) -> Float[Array, "3 ..."]:
+    """X's origin from where X puts the mean image point, in the probe's frame, mm.
+
+    Pixel row 0 need not be at the transducer's face: a pixel's size does not scale the range of row
+    0, the sound speed does.
+
+    Args:
+        of_mean: where X puts the mean image point.
+        mean: of the [lateral, axial] image points at nominal pixel sizes and sound speed.
+        lateral: first column of X's rotation.
+        axial: its last column.
+        scale: factors on [lateral, axial] lengths of the image.
+        face: range of row 0 at the nominal sound speed.
+        moved_face: the same at the sound speed that was found.
+    """
+    depth = scale[1] * (mean[1] - face) + moved_face
+    return of_mean - scale[0] * mean[0] * lateral - depth * axial
+
+
 def chord_angle(difference: Float[Array, "3 3 *batch"]) -> Float[Array, "*batch"]:
     """Angle (rad) between two rotations, from their difference; batch axes last.
 

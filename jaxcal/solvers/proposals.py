@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxcal.data.geometry import orthonormal_pair
+from jaxcal.data.geometry import origin_from_mean, orthonormal_pair
 from jaxcal.data.problem import Problem
 from jaxcal.model.parameters import Parameters
 from jaxcal.model.residuals import measured_points
@@ -117,11 +117,9 @@ def linear_proposals(
         rest = dense.solve_positive(
             matrix[6:, 6:], (system[6:12, 12] - system[6:12, :6] @ known)[:, None]
         )[:, 0]
-        # Pixel row 0 need not be at the transducer's face: a pixel's size does not scale the range
-        # of row 0, the sound speed does.
-        face = speed * problem.face_offset
-        depth = scale[1] * (mean[1] - problem.face_offset) + face
-        translation = length * rest[:3] - scale[0] * mean[0] * lateral - depth * axial
+        face = problem.face_offset
+        of_mean = length * rest[:3]
+        translation = origin_from_mean(of_mean, mean, lateral, axial, scale, face, speed * face)
         rotation = jnp.stack([lateral, jnp.cross(axial, lateral), axial], axis=1)
         point, pixel = length * rest[3:] + centre, scale.at[1].divide(speed)
         return replace(Parameters.of(rotation, translation, point, pixel), sound_speed=speed)

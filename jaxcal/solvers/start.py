@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxcal.data.geometry import orthonormal_pair
+from jaxcal.data.geometry import origin_from_mean, orthonormal_pair
 from jaxcal.model.batch import ImagePlanes, Iterate, barrier, choose
 from jaxcal.model.observations import InPlane
 from jaxcal.model.parameters import Parameters
@@ -110,13 +110,13 @@ def _with_rotation(reduced: ReducedBatch, lateral: Array, axial: Array, blocks: 
         scale = jnp.maximum(jnp.abs(_scales(reduced, lateral, axial)), tiny)
     columns = jnp.concatenate([scale[0] * lateral, scale[1] * axial])
     of_mean, target = reduced.origin_and_target(columns)
-    depth = scale[1] * (reduced.mean[1] - reduced.face) + reduced.face
+    face = reduced.face
     free = {name: [TABLE[name].nominal * one] * TABLE[name].size for name in FURTHER}
     free["scale"] = [*scale]
     values = [value for name in FURTHER if name in blocks for value in free[name]]
     return Iterate(
         jnp.stack([lateral, jnp.cross(axial, lateral, axis=0), axial], axis=1),
-        of_mean - scale[0] * reduced.mean[0] * lateral - depth * axial,
+        origin_from_mean(of_mean, reduced.mean, lateral, axial, scale, face, face),
         reduced.centre + target,
         jnp.stack(values) if values else jnp.zeros((0, *one.shape), one.dtype),
         blocks,
