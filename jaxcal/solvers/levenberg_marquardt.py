@@ -28,7 +28,7 @@ More, "The Levenberg-Marquardt algorithm: implementation and theory", 1978.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
 import equinox as eqx
@@ -301,50 +301,69 @@ def iterate_once(
     )
     if undamped:
         accept, damping = jnp.isfinite(normal.cost), jnp.zeros_like(damping)
-
     iterate = choose(accept & state.active, state.candidate, state.iterate)
     cost = jnp.where(accept, normal.cost, state.cost)
     cosine = jnp.where(accept, gradient_cosine(normal, rounding.vanished), state.cosine)
+
     move, predicted, indefinite = damped_step(normal, damping)
     indefinite = indefinite & accept
     # Indefinite: the same iterate again without second derivatives, or with more damping.
     more = jnp.maximum(DAMPING_INCREASE * damping, LEAST_DAMPING)
     damping = jnp.where(indefinite & (state.exact_next == 0), more, damping)
     retry = indefinite | jnp.logical_not(accept)
-    candidate = choose(retry, iterate, state.candidate.moved(move))
-
-    iterations = state.iterations + 1
-    stopped = (stalled >= MOST_STALLED) | (damping > LARGEST_DAMPING) | (iterations >= max_steps)
-    squared_cosine = QUADRATIC_FACTOR * cosine * cosine
-    final_step = (
-        (state.exact_next > 0)
-        & (damping < LITTLE_DAMPING)
-        & jnp.logical_not(retry)
-        & (squared_cosine <= tolerance)
-        & (predicted <= FINAL_DECREASE * cost)
-        & (cosine > tolerance)
-    )
     exact_next = (cosine < exact_below) & jnp.logical_not(indefinite | undamped)
+
+    # What the step leads to; whether it is the last one is decided below.
     after = Descent(
         iterate=iterate,
         cost=cost,
-        cosine=jnp.where(final_step, squared_cosine, cosine),
-        candidate=candidate,
+        cosine=cosine,
+        candidate=choose(retry, iterate, state.candidate.moved(move)),
         retry=retry,
         exact_used=jnp.where(accept, state.exact_next, state.exact_used),
         exact_next=jnp.where(exact_next, 1.0, 0.0).astype(half.dtype),
         damping=damping,
         predicted=predicted,
         stalled=stalled,
-        iterations=iterations,
-        converged=(cosine <= CONVERGED_WITHIN * tolerance) | final_step | (stalled >= MOST_STALLED),
-        active=(cosine > tolerance) & jnp.logical_not(stopped | final_step),
+        iterations=state.iterations + 1,
+        converged=state.converged,
+        active=state.active,
         trace=recorded(state.trace, state.iterations, cost),
     )
-    after = choose(state.active, after, eqx.tree_at(lambda old: old.iterate, state, iterate))
-    return eqx.tree_at(
-        lambda new: new.iterate, after, choose(final_step & state.active, candidate, after.iterate)
+    return _stopped(state, after, tolerance, max_steps)
+
+
+def _stopped(before: Descent, after: Descent, tolerance: float, max_steps: int) -> Descent:
+    """The state after a pass, with every problem ended that is done or given up.
+
+    A last step that is not evaluated is taken here: its candidate becomes the iterate.
+
+    Args:
+        before: the state before the pass; problems that had ended keep all of it.
+        after: the state that the pass and the next step lead to.
+        tolerance: gradient cosine to stop at.
+        max_steps: most passes.
+    """
+    cosine, stalled = after.cosine, after.stalled >= MOST_STALLED
+    given_up = stalled | (after.damping > LARGEST_DAMPING) | (after.iterations >= max_steps)
+    squared_cosine = QUADRATIC_FACTOR * cosine * cosine
+    final_step = (
+        (before.exact_next > 0)
+        & (after.damping < LITTLE_DAMPING)
+        & jnp.logical_not(after.retry)
+        & (squared_cosine <= tolerance)
+        & (after.predicted <= FINAL_DECREASE * after.cost)
+        & (cosine > tolerance)
     )
+    ended = replace(
+        after,
+        cosine=jnp.where(final_step, squared_cosine, cosine),
+        converged=(cosine <= CONVERGED_WITHIN * tolerance) | final_step | stalled,
+        active=(cosine > tolerance) & jnp.logical_not(given_up | final_step),
+    )
+    found = choose(before.active, ended, replace(before, iterate=after.iterate))
+    last = choose(final_step & before.active, after.candidate, found.iterate)
+    return replace(found, iterate=last)
 
 
 def minimise(
