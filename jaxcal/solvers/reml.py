@@ -32,6 +32,8 @@ References: Helmert 1924; Patterson and Thompson 1971 (REML); Foerstner 1979.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -237,6 +239,39 @@ class Tuning(eqx.Module):
         sums = barrier(
             component_sums(state.candidate, observed, self.images, state.proposed, self.medium)
         )
+        accept, here = self.judged(state, sums)
+        # Where the candidate is refused, the proposal from its sums is not used.
+        exact = here.cosine <= EXACT_TUNING_BELOW
+        exact = jnp.where(exact, 1.0, 0.0).astype(self.coordinates.dtype)
+        found = self.propose(sums, here.sigma, here.damping, exact)
+        change = jnp.max(jnp.abs(jnp.log(found.updated / here.sigma)), axis=0)
+        more = jnp.maximum(DAMPING_INCREASE * here.damping, LEAST_DAMPING)
+        retry = found.indefinite | jnp.logical_not(accept)
+        after = replace(
+            here,
+            updated=jnp.where(accept, found.updated, state.updated),
+            change=jnp.where(accept, change, state.change),
+            candidate=choose(retry, here.iterate, here.iterate.moved(barrier(found.move))),
+            proposed=jnp.where(retry, here.sigma, found.sigma),
+            units=state.proposed,
+            retry=retry,
+            step_sigma=found.step_sigma,
+            half_cost=0.5 * sums.weighted(1 / found.step_sigma**2).cost,
+            predicted=found.predicted,
+            exact_used=found.exact,
+            damping=jnp.where(found.indefinite & accept, more, here.damping),
+            iterations=state.iterations + 1,
+            trace=recorded(state.trace, state.iterations, here.cost),
+        )
+        return choose(state.active, self.stopped(after, accept), state)
+
+    def judged(
+        self, state: SelfTuned, sums: ComponentSums
+    ) -> tuple[Bool[Array, " batch"], SelfTuned]:
+        """Whether the candidate is taken, and the state at the iterate that is kept.
+
+        Of that state, the candidate and all that belongs to the next step are still the old ones.
+        """
         crude = with_least_sigma(jnp.sqrt(sums.squares / self.count))
         crude = jnp.where(self.enough, crude, self.fallback)
         proposed = jnp.where(state.iterations == 0, crude, state.proposed)
@@ -258,42 +293,16 @@ class Tuning(eqx.Module):
                 (state.iterate, state.sigma, state.cost, state.cosine),
             )
         )
-        # Where the candidate is refused, the proposal from its sums is not used.
-        exact = jnp.where(cosine <= EXACT_TUNING_BELOW, 1.0, 0.0).astype(self.coordinates.dtype)
-        found = self.propose(sums, sigma, damping, exact)
-        change = jnp.max(jnp.abs(jnp.log(found.updated / sigma)), axis=0)
-        change = jnp.where(accept, change, state.change)
-        there = (cosine <= self.cosine_tolerance) | (stalled >= MOST_STALLED)
-        done = there & (change <= self.sigma_tolerance) & accept
-        more = jnp.maximum(DAMPING_INCREASE * damping, LEAST_DAMPING)
-        damping = jnp.where(found.indefinite & accept, more, damping)
-        iterations = state.iterations + 1
-        given_up = (damping > LARGEST_DAMPING) | (iterations >= self.max_steps)
-        given_up = given_up | jnp.logical_not(jnp.isfinite(cost))
-        retry = found.indefinite | jnp.logical_not(accept)
-        new = SelfTuned(
-            iterate=iterate,
-            sigma=sigma,
-            updated=jnp.where(accept, found.updated, state.updated),
-            cost=cost,
-            change=change,
-            cosine=cosine,
-            candidate=choose(retry, iterate, iterate.moved(barrier(found.move))),
-            proposed=jnp.where(retry, sigma, found.sigma),
-            units=state.proposed,
-            retry=retry,
-            step_sigma=found.step_sigma,
-            half_cost=0.5 * sums.weighted(1 / found.step_sigma**2).cost,
-            predicted=found.predicted,
-            exact_used=found.exact,
-            damping=damping,
-            stalled=stalled,
-            iterations=iterations,
-            converged=done,
-            active=jnp.logical_not(done | given_up),
-            trace=recorded(state.trace, state.iterations, cost),
-        )
-        return choose(state.active, new, state)
+        kept = {"iterate": iterate, "sigma": sigma, "cost": cost, "cosine": cosine}
+        return accept, replace(state, **kept, damping=damping, stalled=stalled)
+
+    def stopped(self, after: SelfTuned, accept: Bool[Array, " batch"]) -> SelfTuned:
+        """The state after a pass, with every problem ended that is done or given up."""
+        there = (after.cosine <= self.cosine_tolerance) | (after.stalled >= MOST_STALLED)
+        done = there & (after.change <= self.sigma_tolerance) & accept
+        given_up = (after.damping > LARGEST_DAMPING) | (after.iterations >= self.max_steps)
+        given_up = given_up | jnp.logical_not(jnp.isfinite(after.cost))
+        return replace(after, converged=done, active=jnp.logical_not(done | given_up))
 
 
 def self_tuned(
