@@ -37,6 +37,7 @@ Reference: Minka 2001; Rasmussen and Williams 2006, section 3.6.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 
 import equinox as eqx
@@ -246,22 +247,11 @@ def propagate(
         sweeps: how many under each law; the first of a family gets twice as many, since each of the
             others starts with the sites of the law before it.
     """
-    # Under the Gaussian law the first sites are exact, unless it is cut.
-    exact = [k for k, name in enumerate(families) if name == "gaussian" and sites.interval is None]
-    swept: list[Family] = [name for k, name in enumerate(families) if k not in exact]
-    names = tuple(dict.fromkeys(swept))
-    turns: list[tuple[int, int, bool]] = []
-    last = []
-    for which, name in enumerate(names):
-        at = [k for k, family in enumerate(families) if family == name]
-        turns.append((which, at[0], True))
-        for k in at:
-            last.append((k, len(turns)))
-            turns.append((which, k, False))
-    under = _Laws(names, sites, known, squares, pull)
+    plan = _Schedule.of(families, cut=sites.interval is not None)
+    under = _Laws(plan.names, sites, known, squares, pull)
     parts: list[Posterior] = []
-    if turns:
-        family, law, fresh = (jnp.asarray(column) for column in zip(*turns, strict=True))
+    if plan.turns:
+        family, law, fresh = (jnp.asarray(column) for column in zip(*plan.turns, strict=True))
         # The first turn starts afresh, so it does not use this state.
         gaussian, start = traced_once(under.gaussian, sd[0])
 
@@ -271,13 +261,49 @@ def propagate(
             return under.swept(family, sd, state, sweeps)
 
         parts.append(jax.lax.scan(one, start, (family, sd[law], fresh))[1])
-    for k in exact:
-        last.append((k, len(turns) + exact.index(k)))
+    for k in plan.exact:
         parts.append(jax.tree.map(lambda leaf: leaf[None], under.under_gaussian(sd[k])))
-    order = jnp.asarray([turn for _, turn in sorted(last)])
+    order = jnp.asarray(plan.order)
     return barrier(
         jax.tree.map(lambda *leaf: jnp.moveaxis(jnp.concatenate(leaf)[order], 0, -2), *parts)
     )
+
+
+@dataclass(frozen=True)
+class _Schedule:
+    """In which order the laws are swept.
+
+    Attributes:
+        names: families whose laws need sweeps.
+        turns: (index in ``names``, number of the law, whether it starts afresh), one after the
+            other. The first law of a family has two turns, and each of the others starts with the
+            sites of the law before it.
+        exact: numbers of the laws that need no sweep; their results follow those of the turns.
+        order: for every law, which of these results is its own.
+    """
+
+    names: tuple[Family, ...]
+    turns: list[tuple[int, int, bool]]
+    exact: list[int]
+    order: list[int]
+
+    @classmethod
+    def of(cls, families: Sequence[Family], *, cut: bool) -> _Schedule:
+        """The schedule of laws; ``cut``: the offsets are confined to intervals."""
+        # Under the Gaussian law the first sites are exact, unless it is cut.
+        exact = [k for k, name in enumerate(families) if name == "gaussian" and not cut]
+        swept: list[Family] = [name for k, name in enumerate(families) if k not in exact]
+        names = tuple(dict.fromkeys(swept))
+        turns: list[tuple[int, int, bool]] = []
+        place: dict[int, int] = {}
+        for which, name in enumerate(names):
+            laws = [k for k, family in enumerate(families) if family == name]
+            turns.append((which, laws[0], True))
+            for k in laws:
+                place[k] = len(turns)
+                turns.append((which, k, False))
+        place |= {k: len(turns) + position for position, k in enumerate(exact)}
+        return cls(names, turns, exact, [place[k] for k in range(len(families))])
 
 
 class _Belief(eqx.Module):
