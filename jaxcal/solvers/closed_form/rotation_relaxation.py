@@ -27,7 +27,7 @@ from functools import cache
 
 import numpy as np
 
-from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.array_types import Float, Int
 from jaxcal.solvers.closed_form.reduced_objective import ReducedObjective
 
 BARRIER_DECREASE = 0.15
@@ -83,6 +83,72 @@ def _equations(scaled: bool) -> Float[np.ndarray, "m v v"]:
     return right[values > 1e-9].reshape(-1, size, size)
 
 
+@dataclass(frozen=True)
+class _Program:
+    """Maximise ``multipliers[0]`` with cost + sum_j multipliers_j directions_j positive definite.
+
+    Everything is divided by ``unit``, and f is 0 at the point near which the bound is wanted.
+
+    Attributes:
+        cost: F.
+        directions: -e0 e0' of the bound, then the matrices B_j.
+        start: strictly feasible multipliers.
+        unit: mm^2.
+        where: places of (a1, a3) in v.
+    """
+
+    cost: Float[np.ndarray, "v v"]
+    directions: Float[np.ndarray, "m v v"]
+    start: Float[np.ndarray, " m"]
+    unit: float
+    where: Int[np.ndarray, " 6"]
+
+    @classmethod
+    def of(cls, reduced: ReducedObjective, x: Float[np.ndarray, " 6"]) -> _Program | None:
+        """The program of :func:`lower_bound`, or None where there is no such relaxation."""
+        free = reduced.constraints.free
+        if free not in ((), ("common",)):
+            return None
+        scaled = bool(free)
+        equations = _equations(scaled)
+        size = equations.shape[1]
+        first = size - 9
+        where = np.r_[first : first + 3, first + 6 : first + 9]
+        unit = float(np.linalg.norm(reduced.factor, 2)) ** 2
+        if unit == 0:
+            return None
+        squared = reduced.factor.T @ reduced.factor / unit
+        slope = reduced.factor.T @ reduced.shift / unit
+        cost = np.zeros((size, size))
+        cost[np.ix_(where, where)] = squared
+        cost[0, where] = cost[where, 0] = slope
+        # With this constant f(x), and so the bound sought, is 0; f(x) = |Cx + g|^2 + rest.
+        cost[0, 0] = -(x @ squared @ x + 2 * slope @ x)
+        shape = np.zeros(size)
+        if scaled:
+            least = float(np.linalg.eigvalsh(squared)[0])
+            if least < 1e-12:
+                return None
+            shape[1:] = least * np.array([0.5, *[-0.5] * 3, *[0.5] * 3, *[-0.5] * 3])
+        else:
+            shape[1:] = 1.0
+            shape[0] = -3.0
+        start = np.diag(shape)
+        matrix = cost + start
+        # The Schur complement of the first row, less a margin.
+        rest = np.linalg.solve(matrix[1:, 1:], matrix[1:, 0])
+        bound = float(matrix[0, 0] - matrix[0, 1:] @ rest) - 1.0
+        corner = np.zeros((1, size, size))
+        corner[0, 0, 0] = -1.0
+        directions = np.concatenate([corner, equations])
+        multipliers = np.append(bound, np.einsum("jkl,kl->j", equations, start))
+        return cls(cost, directions, multipliers, unit, where)
+
+    def root(self, multipliers: Float[np.ndarray, " m"]) -> Float[np.ndarray, "v v"]:
+        """Cholesky factor of Z; LinAlgError where Z is not positive definite."""
+        return np.linalg.cholesky(self.cost + np.tensordot(multipliers, self.directions, 1))
+
+
 def lower_bound(
     reduced: ReducedObjective, x: Float[np.ndarray, " 6"], enough: float
 ) -> Relaxation | None:
@@ -97,61 +163,45 @@ def lower_bound(
         None where there is no such relaxation: a lateral or axial scale of its own, a common scale
         with a singular factor, or a factor of zero.
     """
-    free = reduced.constraints.free
-    if free not in ((), ("common",)):
+    program = _Program.of(reduced, x)
+    if program is None:
         return None
-    scaled = bool(free)
-    equations = _equations(scaled)
-    count, size = equations.shape[:2]
-    first = size - 9
-    where = np.r_[first : first + 3, first + 6 : first + 9]
-    unit = float(np.linalg.norm(reduced.factor, 2)) ** 2
-    if unit == 0:
-        return None
-    squared = reduced.factor.T @ reduced.factor / unit
-    slope = reduced.factor.T @ reduced.shift / unit
-    cost = np.zeros((size, size))
-    cost[np.ix_(where, where)] = squared
-    cost[0, where] = cost[where, 0] = slope
-    # With this constant f(x), and so the bound sought, is 0; f(x) = |Cx + g|^2 + rest.
-    cost[0, 0] = -(x @ squared @ x + 2 * slope @ x)
-    shape = np.zeros(size)
-    if scaled:
-        least = float(np.linalg.eigvalsh(squared)[0])
-        if least < 1e-12:
-            return None
-        shape[1:] = least * np.array([0.5, *[-0.5] * 3, *[0.5] * 3, *[-0.5] * 3])
-    else:
-        shape[1:] = 1.0
-        shape[0] = -3.0
-    start = np.diag(shape)
-    matrix = cost + start
-    # The Schur complement of the first row, less a margin.
-    rest = np.linalg.solve(matrix[1:, 1:], matrix[1:, 0])
-    bound = float(matrix[0, 0] - matrix[0, 1:] @ rest) - 1.0
-    corner = np.zeros((1, size, size))
-    corner[0, 0, 0] = -1.0
-    directions = np.concatenate([corner, equations])
-    multipliers = np.append(bound, np.einsum("jkl,kl->j", equations, start))
-    goal = np.zeros(count + 1)
+    gap, lower = _least_gap(program, enough / program.unit)
+    inverse = np.linalg.inv(lower)
+    moments = inverse.T @ inverse
+    ideal = moments[program.where, 0] / moments[0, 0]
+    return Relaxation(max(gap, 0.0) * program.unit, ideal)
+
+
+def _least_gap(program: _Program, enough: float) -> tuple[float, Float[np.ndarray, "v v"]]:
+    """The barrier method: the least gap that was proved, and Z's factor at the end.
+
+    Args:
+        program: the bound's semidefinite program.
+        enough: stop when the gap is below this, in the program's unit.
+    """
+    directions, size = program.directions, len(program.cost)
+    count = len(directions)
+    multipliers = program.start
+    goal = np.zeros(count)
     goal[0] = 1.0
-    weight = max(-bound, 1e-3) / size
-    lower = np.linalg.cholesky(cost + np.tensordot(multipliers, directions, 1))
-    best = -bound
+    best = -float(multipliers[0])
+    weight = max(best, 1e-3) / size
+    lower = program.root(multipliers)
     for _ in range(MOST_STEPS):
         inverse = np.linalg.inv(lower)
-        turned = (inverse @ directions @ inverse.T).reshape(count + 1, -1)
-        slope_of_barrier = turned @ np.eye(size).ravel()
+        turned = (inverse @ directions @ inverse.T).reshape(count, -1)
+        slope = turned @ np.eye(size).ravel()
         curvature = turned @ turned.T
         step = np.linalg.solve(
-            curvature + 1e-14 * np.diag(np.diag(curvature)), goal / weight + slope_of_barrier
+            curvature + 1e-14 * np.diag(np.diag(curvature)), goal / weight + slope
         )
         decrement = float(np.sqrt(max(step @ curvature @ step, 0.0)))
         length = 1.0 if decrement < 0.25 else 1 / (1 + decrement)
         for _ in range(30):
             trial = multipliers + length * step
             try:
-                lower = np.linalg.cholesky(cost + np.tensordot(trial, directions, 1))
+                lower = program.root(trial)
             except np.linalg.LinAlgError:
                 length /= 2
                 continue
@@ -162,10 +212,7 @@ def lower_bound(
         best = min(best, -float(multipliers[0]))
         if decrement < CENTRED_BELOW:
             # On the central path the bound is within size * weight of the largest one.
-            if best <= enough / unit or weight * size < 0.02 * best or weight < 1e-15:
+            if best <= enough or weight * size < 0.02 * best or weight < 1e-15:
                 break
             weight *= BARRIER_DECREASE
-    inverse = np.linalg.inv(lower)
-    moments = inverse.T @ inverse
-    ideal = moments[where, 0] / moments[0, 0]
-    return Relaxation(max(best, 0.0) * unit, ideal)
+    return best, lower
