@@ -86,16 +86,9 @@ def _with_uncertainty(found: ClosedForm, problem: Problem, plan: SolvePlan) -> C
 
     values = [seen.unknowns.further[name] for name in FURTHER if name in blocks]
     further = np.array([component[0] for value in values for component in value])
-    gradient = np.abs(errors @ rows)
-    length = np.sqrt(np.diag(design) * objective)
-    # With exact data the errors are only rounding, and their gradient means nothing.
-    exact = objective <= rounding(used, lever)
-    cosine = 0.0 if exact else float(np.max(gradient / np.maximum(length, 1e-300)))
-    trace = None
-    if plan.options.trace:
-        trace = np.full(plan.options.trace, np.nan)
-        trace[0] = objective
-    none = np.zeros(())
+    exact = bool(objective <= rounding(used, lever))
+    convergence = _convergence(rows, errors, design, exact=exact, plan=plan)
+    still = float(convergence.stationarity) <= STATIONARY
     return Calibration(
         image_to_probe=found.image_to_probe,
         point=found.point_mm,
@@ -109,20 +102,9 @@ def _with_uncertainty(found: ClosedForm, problem: Problem, plan: SolvePlan) -> C
         rms=np.asarray(np.sqrt(objective / used)),
         mask=np.asarray(problem.mask, float),
         status_code=np.asarray(status, np.int32),
-        differentiable=np.asarray(plan.options.differentiate and not weak and cosine <= STATIONARY),
+        differentiable=np.asarray(plan.options.differentiate and not weak and still),
         sigma_tuned=np.asarray(False),
-        convergence=Convergence(
-            cost=np.asarray(objective),
-            stationarity=np.asarray(cosine),
-            tolerance_met=np.asarray(True),
-            iterations=np.asarray(0, np.int32),
-            variance_rounds=np.asarray(0, np.int32),
-            searched_start=np.asarray(False),
-            sigma_floored=np.zeros(3, bool),
-            rotation_change=none,
-            translation_change=none,
-            trace=trace,
-        ),
+        convergence=convergence,
         linearisation=Linearisation(
             information=information,
             design=design,
@@ -137,6 +119,46 @@ def _with_uncertainty(found: ClosedForm, problem: Problem, plan: SolvePlan) -> C
         data="points",
         blocks=blocks,
         robust=False,
+    )
+
+
+def _convergence(
+    rows: Float[np.ndarray, "m p"],
+    errors: Float[np.ndarray, " m"],
+    design: Float[np.ndarray, "p p"],
+    *,
+    exact: bool,
+    plan: SolvePlan,
+) -> Convergence:
+    """That the closed form took no iteration, and how stationary the answer is.
+
+    Args:
+        rows: derivatives of the errors by the unknowns.
+        errors: residuals of all images, mm; 0 where not used.
+        design: normal matrix of these rows.
+        exact: the errors are only rounding, and their gradient means nothing.
+        plan: the request.
+    """
+    objective = float(errors @ errors)
+    gradient = np.abs(errors @ rows)
+    length = np.sqrt(np.diag(design) * objective)
+    cosine = 0.0 if exact else float(np.max(gradient / np.maximum(length, 1e-300)))
+    trace = None
+    if plan.options.trace:
+        trace = np.full(plan.options.trace, np.nan)
+        trace[0] = objective
+    none = np.zeros(())
+    return Convergence(
+        cost=np.asarray(objective),
+        stationarity=np.asarray(cosine),
+        tolerance_met=np.asarray(True),
+        iterations=np.asarray(0, np.int32),
+        variance_rounds=np.asarray(0, np.int32),
+        searched_start=np.asarray(False),
+        sigma_floored=np.zeros(3, bool),
+        rotation_change=none,
+        translation_change=none,
+        trace=trace,
     )
 
 
