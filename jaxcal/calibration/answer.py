@@ -92,32 +92,14 @@ def assemble(
     blocks, mask, parameters = plan.blocks, problem.mask, iterate.parameters()
     used = jnp.sum(mask, axis=-1)
     errors = Errors.of(iterate, images)
-    elevation = mask * errors.q[1]
     in_plane = errors.squares(errors.q[1], errors.distance)
-    bounds, tracker_sd = None, None
-    if bound is not None and local is not None:
-        elevation = mask * local
-        bounds = ActiveBounds.of(errors, local, bound)
-    elif given.tracker_sd is not None and local is not None:
-        elevation = mask * (errors.q[1] + given.tracker_sd * local)
-        tracker_sd = jnp.broadcast_to(given.tracker_sd, used.shape)
+    elevation, bounds, tracker_sd = _offsets(errors, local, bound, given)
 
     variance = _residual_variance(used, in_plane, bounds, plan)
     lever = jax.lax.stop_gradient(errors.lever())
-    inverse, observed = inverse_and_observability(
-        information,
-        design,
-        variance,
-        mm_at_target(lever, blocks).T,
-        LARGEST_SD * lever,
-        bounded=plan.prior == "bounded",
+    inverse, information, observed = _inverse(
+        information, design, axes, variance=variance, lever=lever, used=used, plan=plan
     )
-    if axes is not None:
-        parts = jax.vmap(stacked)(axes.matrix)
-        variances = variances_by_axis(parts, axes.squares, used, inverse, lever)
-        inverse = covariance_by_axis(parts, variances, inverse)
-        observable = jnp.logical_not(observed.degenerate | observed.weak)
-        information = jnp.where(observable, inverse_batch_last(inverse)[0], information)
     status, averaged = _status(iterate, convergence, observed, used), found.averaged
     covariance = _covariance(jnp.moveaxis(variance * inverse, -1, 0), averaged, status)
     prior_sd = None
@@ -177,6 +159,65 @@ def _normal_matrices(
     if geometry is observation:
         return weighted, weighted, None
     return weighted, accumulate(iterate, geometry, images, None).stacked(), None
+
+
+def _offsets(
+    errors: Errors, local: Array | None, bound: Array | None, given: Given
+) -> tuple[Float[Array, "*batch n"], ActiveBounds | None, Float[Array, "*batch"] | None]:
+    """The offsets, mm; the state of their bounds and the SD of tracked positions, if they have any.
+
+    Args:
+        errors: at the solution.
+        local: every image's own unknown: its offset where there are bounds, else the tracker's
+            elevational error in SDs; None without one.
+        bound: largest offsets, mm, or None.
+        given: the numbers in the request.
+    """
+    mask = errors.mask
+    if local is not None and bound is not None:
+        return mask * local, ActiveBounds.of(errors, local, bound), None
+    if local is not None and given.tracker_sd is not None:
+        tracker_sd = jnp.broadcast_to(given.tracker_sd, mask.shape[:-1])
+        return mask * (errors.q[1] + given.tracker_sd * local), None, tracker_sd
+    return mask * errors.q[1], None, None
+
+
+def _inverse(
+    information: Float[Array, "p p batch"],
+    design: Float[Array, "p p batch"],
+    axes: ComponentSums | None,
+    *,
+    variance: Float[Array, " batch"],
+    lever: Float[Array, " batch"],
+    used: Float[Array, " batch"],
+    plan: SolvePlan,
+) -> tuple[Float[Array, "p p batch"], Float[Array, "p p batch"], Observability]:
+    """The covariance for residuals of variance 1, its inverse, and what is observable.
+
+    Args:
+        information: S.
+        design: D.
+        axes: the parts of the axes, where each has a variance of its own.
+        variance: of the residuals.
+        lever: root mean square distance of the points from the image origin, mm.
+        used: number of images in use.
+        plan: of the solve.
+    """
+    inverse, observed = inverse_and_observability(
+        information,
+        design,
+        variance,
+        mm_at_target(lever, plan.blocks).T,
+        LARGEST_SD * lever,
+        bounded=plan.prior == "bounded",
+    )
+    if axes is not None:
+        parts = jax.vmap(stacked)(axes.matrix)
+        variances = variances_by_axis(parts, axes.squares, used, inverse, lever)
+        inverse = covariance_by_axis(parts, variances, inverse)
+        observable = jnp.logical_not(observed.degenerate | observed.weak)
+        information = jnp.where(observable, inverse_batch_last(inverse)[0], information)
+    return inverse, information, observed
 
 
 def _residual_variance(
