@@ -94,11 +94,11 @@ def apart_in_image(
         problem: for the given size of a pixel, and the range of pixel row 0.
         grid: points of the image by the first one, [lateral, axial], mm.
     """
-    stretch = _pixel_size(second, problem) / _pixel_size(first, problem)
+    lateral, axial = _pixel_size(second, problem) / _pixel_size(first, problem)
     x, other = np.asarray(first.image_to_probe), np.asarray(second.image_to_probe)
     # Pixel sizes do not stretch the range of row 0.
-    shift = (1 - stretch[1]) * np.asarray(problem.face_offset, float)
-    return float(rms_distance(stretched(other, *stretch, shift), x, grid))
+    shift = (1 - axial) * np.asarray(problem.face_offset, float)
+    return float(rms_distance(stretched(other, lateral, axial, shift), x, grid))
 
 
 def _pixel_size(found: ClosedForm | Calibration, problem: Problem) -> Float[np.ndarray, " 2"]:
