@@ -31,7 +31,7 @@ from jaxcal.data.problem import Channels
 from jaxcal.data.recording import make_images
 from jaxcal.diagnostics import frame_checks
 from jaxcal.diagnostics.influence import WhitenedErrors, influence_of, whitened_errors
-from jaxcal.model.image_points import distance
+from jaxcal.model.image_points import rms_distance
 from jaxcal.report.accuracy import GOOD_MM
 from jaxcal.report.record import calibration_record, further_unknowns
 from jaxcal.runtime.arrays import batch_of_one
@@ -239,9 +239,7 @@ def _good_and_wrong(made) -> tuple[bool, bool]:
     record = result.record()
     if record["verdict"] not in ("good", "fair"):
         return False, False
-    error = distance(
-        np.asarray(result.image_to_probe), made.image_to_probe, np.ones(2), made.points, 0.0
-    )
+    error = rms_distance(np.asarray(result.image_to_probe), made.image_to_probe, made.points)
     return True, bool(error > record["tre"]["interval_95_mm"][1])
 
 

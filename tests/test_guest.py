@@ -144,7 +144,8 @@ def test_a_float64_problem_inside_a_transformation_without_64_bits_gets_one_clea
         jax.grad(lambda p: jaxcal.calibrate(p, "conventional").rms),
         jax.vmap(jaxcal.calibrate_batch),
     ):
-        data = jaxcal.stack([jaxcal.stack([there])]) if "batch" in str(transformed) else there
+        batch = jax.tree.map(lambda leaf: leaf[None, None], there)
+        data = batch if "batch" in str(transformed) else there
         with jax.enable_x64(False), pytest.raises(jaxcal.InputError, match="enable_x64") as error:
             transformed(data)
         assert "\n" not in str(error.value)
