@@ -45,7 +45,7 @@ def judged(result, gaussian, recording: Recording, x: np.ndarray) -> list[float]
     record = calibration_record(result, recording)
     grid = region_of(result, recording).grid()[:, [0, 2]]
     error, other = (
-        rms_distance(np.asarray(each.image_to_probe), x, grid) for each in (result, gaussian)
+        float(rms_distance(np.asarray(each.image_to_probe), x, grid)) for each in (result, gaussian)
     )
     tre = record["tre"]
     if tre is None or tre["stated_mm"] is None:
