@@ -32,6 +32,7 @@ References: Cook 1977 (leaving out); MacKinnon and White 1985 (the residuals' co
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -96,14 +97,11 @@ class WhitenedErrors:
     variances: Float[Array, " k"]
 
     def covariances(
-        self, precision: Float[Array, " p"]
+        self, precision: Float[Array, " p"], invert: Callable[[Array], Array] = np.linalg.inv
     ) -> tuple[Float[Array, "p p"], Float[Array, "p p"]]:
-        """S^-1 and the covariance of the unknowns, with the precision of their priors.
-
-        NaN where the images do not determine all unknowns.
-        """
+        """S^-1 and the covariance of the unknowns, with the precision of their priors."""
         by_error, prior = np.einsum("mkp,mkq->kpq", self.rows, self.rows), np.diag(precision)
-        inverse = _inverse(by_error.sum(axis=0) + prior)
+        inverse = invert(by_error.sum(axis=0) + prior)
         if (self.variances == 1).all():
             return inverse, inverse
         middle = np.einsum("k,kpq->pq", self.variances, by_error) + prior
@@ -111,6 +109,7 @@ class WhitenedErrors:
 
 
 def _inverse(matrix: Float[Array, "p p"]) -> Float[Array, "p p"]:
+    """NaN where the images do not determine all unknowns."""
     return inverses(matrix[None], np.finfo(float).eps)[0]
 
 
@@ -142,7 +141,7 @@ def _influence(
     """Influence of whitened errors and a prior of this precision, from which the answer is away."""
     rows, errors = found.rows, found.errors
     components = rows.shape[1]
-    inverse, covariance = found.covariances(precision)
+    inverse, covariance = found.covariances(precision, _inverse)
     if not at_minimum:
         # An answer averaged over laws, or an alternation that stopped early, does not minimise
         # these errors: take them at the minimum.
@@ -302,7 +301,7 @@ def conventional_fit(
     sd = float(np.sqrt(np.sum(plain.errors**2) / left))
     scaled = _equal_weights(seen, zero, sd, used)
     none = np.zeros(scaled.rows.shape[2])
-    inverse, _ = scaled.covariances(none)
+    inverse, _ = scaled.covariances(none, _inverse)
     kind = scaled.kind
     steps, noise = scaled.rows @ inverse / sd, noise[used][:, kind[:, None], kind]
     covariance = np.einsum("nkp,nkl,nlq->pq", steps, noise, steps)
