@@ -50,15 +50,17 @@ claim(
         max(number(row, "rest_max_ms") for row in _PROMPT),
     ],
 )
-claim(
-    SAFETY,
-    "answers were lost, within {:.0f} ms",
-    lambda: [
-        number(row, "rest_max_ms")
-        for row in table("robot_faults")
-        if row["fault"] == "lost answers"
-    ],
-)
+for _words, _fault in (
+    ("answers were lost, within {:.0f} ms", "lost answers"),
+    ("takes `stopL` but goes on, within {:.0f} ms", "unheeded stop"),
+):
+    claim(
+        SAFETY,
+        _words,
+        lambda fault=_fault: [
+            number(row, "rest_max_ms") for row in table("robot_faults") if row["fault"] == fault
+        ],
+    )
 claim(
     POSES,
     "errors of plans are at most {:.1f} % above",
