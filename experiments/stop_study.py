@@ -394,7 +394,7 @@ def main() -> int:
 
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="5 trials for each way")
-    parser.add_argument("--trials", type=int, default=125, help="for each series and way")
+    parser.add_argument("--trials", type=int, default=60, help="for each series and way")
     parser.add_argument("--ways", default=",".join(WAYS), help="some of them, with commas between")
     parser.add_argument("--robots", type=int, default=2, help="at once")
     given = parser.parse_args()
