@@ -1,9 +1,10 @@
 """Prior ``auto`` on distributions of the offsets that differ from those which it weighs.
 
-Exponential, two-humped, drifting, outlying and off-centre offsets (:mod:`jaxcal.study.offsets`) for
-8, 20 and 50 images and five pairs of size and noise, and the five distributions of ``auto_grid``
-for 8 images. On the same draws: conventional calibration, the paper's alternation (1 mm), prior
-``auto`` from points with covariances (``auto``) and from points alone (``auto_points``).
+Exponential, two-humped, drifting, outlying, off-centre and sometimes off-centre offsets
+(:mod:`jaxcal.study.offsets`) for 8, 20 and 50 images and five pairs of size and noise, and the five
+distributions of ``auto_grid`` for 8 images. On the same draws: conventional calibration, the
+paper's alternation (1 mm), and the priors ``auto`` and ``gaussian``, from points with covariances
+and from points alone (``auto_points``, ``gaussian_points``).
 
 A cell in which a ratio that should be at most 1 is not is run again on ten times as many fresh
 draws (``further_laws_again.csv``): a cell picked for being the worst of many says little alone.

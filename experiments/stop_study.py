@@ -18,7 +18,7 @@ than 200 ms after it, or travels more than 15 mm after it, or if the answer was 
 same connection moves again afterwards. Both series of controllers: CB (3.15.8, 125 Hz) and e-Series
 (5.11, 500 Hz). ``stops.csv`` has a row for each series and way, ``stops_each.csv`` every trial.
 
-``--trials N`` for each series and way (default 125), ``--robots N`` at once (default 2: more of
+``--trials N`` for each series and way (default 60), ``--robots N`` at once (default 2: more of
 them share the cores, and what is measured is then the machine), ``--ways`` for some ways only; the
 others' trials are then taken from the table that is there.
 """

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import csv
+import itertools
 import re
 from collections.abc import Callable
-from itertools import pairwise
 from pathlib import Path
 
 from tank_run import Run
@@ -82,26 +82,41 @@ def joint() -> str:
     )
 
 
-def statements() -> str:
-    """Every statement with its verdict, and its evidence in parts."""
-    lines = []
+def _statements() -> list[tuple[str, str, str, list[str]]]:
+    """Section, statement, verdict and evidence of every statement."""
+    found = []
     for row in rows("_statements"):
-        statement = row["statement"]
-        source = row["section"]
+        source, statement = row["section"], row["statement"]
         if statement.startswith("(ours) "):
             source, statement = f"ours, on {source}", statement.removeprefix("(ours) ")
         verdict = row["verdict"].replace("see figures", "no verdict")
-        lines.append(f"- ({source}) *{statement}*: **{verdict}**.")
-        parts = row["evidence"].replace("+-", "±").split("; ")
-        lines += [f"    - {part}" for part in parts]
-    return "\n".join(lines)
+        evidence = row["evidence"].replace("+-", "±").split("; ")
+        found.append((source, statement, verdict, evidence))
+    return found
+
+
+def statements() -> str:
+    """Every statement with its verdict."""
+    lines = [
+        [str(which), source, statement, verdict]
+        for which, (source, statement, verdict, _) in enumerate(_statements(), 1)
+    ]
+    return markdown(["", "section", "statement", "verdict"], lines)
+
+
+def evidence() -> str:
+    """What the verdicts on the statements rest on."""
+    return "\n".join(
+        f"{which}. {'. '.join(part[:1].upper() + part[1:] for part in parts)}."
+        for which, (*_, parts) in enumerate(_statements(), 1)
+    )
 
 
 def sensitivity() -> str:
-    """Errors of X against each number."""
+    """Errors of X at the least and the largest value of each parameter."""
     named = LABELS | {EXACT_ROBOT: EXACT_ROBOT.replace("element_mm", LABELS["element_mm"])}
-    told = rows("_sensitivity")
-    same = [False, *(row["axis"] == last["axis"] for last, row in pairwise(told))]
+    by_axis = itertools.groupby(rows("_sensitivity"), key=lambda row: row["axis"])
+    pairs = [(values[0], values[-1]) for _, group in by_axis if (values := list(group))]
     return markdown(
         [
             "",
@@ -115,7 +130,7 @@ def sensitivity() -> str:
         ],
         [
             [
-                "" if repeated else named[row["axis"]],
+                "" if row is pair[1] else named[row["axis"]],
                 f"{float(row['value']):g}",
                 *(
                     f"{number(row, f'{name}_exact_mm', '.3f')} ± "
@@ -128,7 +143,8 @@ def sensitivity() -> str:
                 f"{number(row, 'joint_over_without_exact_percent', '+.0f')} ± "
                 f"{number(row, 'joint_over_without_exact_half', '.0f')}",
             ]
-            for row, repeated in zip(told, same, strict=True)
+            for pair in pairs
+            for row in pair
         ],
     )
 
@@ -161,18 +177,18 @@ def bounds() -> str:
 
 
 def validation() -> str:
-    """The fast model against the bench."""
+    """The fast model against the bench, over the experiments."""
+    both = [row for row in rows("_validation") if row["fast_model"]]
+    quantities = list(dict.fromkeys(row["quantity"] for row in both))
+
+    def over(quantity: str, name: str) -> str:
+        found = sorted(float(row[name]) for row in both if row["quantity"] == quantity)
+        ends = dict.fromkeys(f"{value:.3f}" for value in (found[0], found[-1]))
+        return " to ".join(ends)
+
     return markdown(
-        ["quantity", "experiment", "fast model, mm", "bench, mm"],
-        [
-            [
-                row["quantity"],
-                row["experiment"],
-                number(row, "fast_model", ".3f") or "-",
-                number(row, "bench", ".3f"),
-            ]
-            for row in rows("_validation")
-        ],
+        ["quantity", "fast model, mm", "bench, mm"],
+        [[name, over(name, "fast_model"), over(name, "bench")] for name in quantities],
     )
 
 
@@ -180,6 +196,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "cells": cells,
     "joint": joint,
     "statements": statements,
+    "evidence": evidence,
     "sensitivity": sensitivity,
     "times": times,
     "bounds": bounds,

@@ -15,10 +15,12 @@ RESULTS = ROOT / "experiments" / "results"
 
 Row = dict[str, str]
 
-README, INDEX, ACCURACY, PAPER, EXPERIMENT, SPEED = PAGES = (
+README, INDEX, ACCURACY, VERDICT, PLANNED, PAPER, EXPERIMENT, SPEED = PAGES = (
     "README.md",
     "docs/results/index.md",
     "docs/results/accuracy.md",
+    "docs/results/verdict.md",
+    "docs/results/poses.md",
     "docs/results/paper.md",
     "docs/results/paper-experiment.md",
     "docs/results/speed.md",

@@ -1,10 +1,8 @@
-"""Claims of the page on accuracy: further laws, stated errors, jumps, held probes, bounds."""
+"""Claims of the pages on accuracy and on the verdict: laws, stated errors, jumps, held probes."""
 
 from __future__ import annotations
 
-from claims import ACCURACY, INDEX, Row, claim, column, number, only, percent, span, table
-
-MIXTURE = {"elevation_distribution": "sometimes off-centre"}
+from claims import ACCURACY, INDEX, VERDICT, Row, claim, column, number, only, percent, span, table
 
 # Further laws.
 claim(
@@ -49,21 +47,6 @@ claim(
 )
 
 # Stated errors.
-claim(
-    ACCURACY,
-    "the predicted TRE is {:.2f} (1.5 mm) and {:.2f} (5 mm) times the actual one, and the "
-    "intervals contain it in {:.1f} and {:.1f} %.",
-    lambda: (
-        *(_mixture("predicted_over_actual")),
-        *percent(_mixture("held_at_points")),
-    ),
-)
-
-
-def _mixture(of: str) -> list[float]:
-    return [only("tre_calibration", of, **MIXTURE, elevation_mm=size) for size in ("1.5", "5")]
-
-
 def _scales(of: str, method: str, prior: str) -> tuple[float, float]:
     where = {"unknowns": "scale", "method": method, "prior": prior}
     return span(column("tre_calibration_scale", of, **where))
@@ -150,14 +133,6 @@ claim(
 )
 claim(
     ACCURACY,
-    "of {:.0f} others each, {:.0f} and {:.0f}.",
-    lambda: (
-        column("weak_direction", "other_integral_paths", path="mean")
-        + column("weak_direction", "other_integral_above_a_tenth")
-    ),
-)
-claim(
-    ACCURACY,
     "with 12 images the mean error in the middle of the image is {:.2f} mm, that of prior "
     "`gaussian` {:.2f} mm.",
     lambda: [
@@ -199,29 +174,35 @@ def _covered(conditions: tuple[str, ...], *frames: str) -> list[float]:
     )
 
 
+def _smooth(*counts: str) -> tuple[str, ...]:
+    return tuple(f"smooth sweep of {count} s apart" for count in counts)
+
+
+for words, conditions in (
+    ("60 frames of 4 to 20 held poses, and sweeps at 20 frames a second", HOLDS + SWEEPS),
+    (
+        "40 or 100 frames along a slow path, errors of successive frames with a correlation of 0, "
+        "0.3 or 0.6",
+        PATHS,
+    ),
+    (
+        "12 to 30 images half a second apart, 100 within five seconds: smooth sweeps, whose "
+        "offsets change as slowly as the pose",
+        _smooth(*SMOOTH),
+    ),
+    (
+        "12 to 30 images half a second apart, offsets drawn anew for every image",
+        tuple(f"sweep of {count}, 0.5 s apart, offsets anew" for count in (12, 20, 30)),
+    ),
+):
+    claim(
+        VERDICT,
+        f"| {words} " + 3 * "| {:.1f} to {:.1f} " + "|",
+        lambda conditions=conditions: _covered(conditions, "calibrate", SAME, EVERY),
+    )
 claim(
-    ACCURACY,
-    "The 95 % intervals of `calibrate` contain the truth in {:.1f} to {:.1f} %, on average over "
-    "the parameters. In the {:.0f} trials of each condition in which every frame was also counted "
-    "as an image, they do in {:.1f} to {:.1f} %, and those with every frame in {:.1f} to {:.1f} %.",
-    lambda: [
-        *_covered(HOLDS + SWEEPS, "calibrate"),
-        *set(_frames("trials", SAME)),
-        *_covered(HOLDS + SWEEPS, SAME, EVERY),
-    ],
-)
-claim(
-    ACCURACY,
-    "Of 40 or 100 frames along a slow path, whose errors have a correlation of 0, 0.3 or 0.6 in "
-    "successive frames, the intervals of `calibrate` contain it in {:.1f} to {:.1f} %; in the "
-    "trials of the comparison in {:.1f} to {:.1f} %, and with every frame an image in {:.1f} to "
-    "{:.1f} %.",
-    lambda: _covered(PATHS, "calibrate", SAME, EVERY),
-)
-claim(
-    ACCURACY,
-    "Of 24 frames with a correlation of 0.6 it is {:.1f} %. In a random order of the poses it is "
-    "{:.1f} % with that correlation.",
+    VERDICT,
+    "in {:.1f} % for 24 frames along a slow path, and in {:.1f} % for 40 frames in a random order",
     lambda: percent(
         [
             *_frames("cover_95_mean", "calibrate", ("path of 24, correlation 0.6",)),
@@ -231,76 +212,41 @@ claim(
 )
 
 
-def _good() -> list[float]:
-    stated, said = "good_outside_99", "verdict_good_outside_99"
-    if any(_frames(stated, "calibrate", HOLDS)) or any(_frames(said, SAME, HOLDS)):
-        raise ValueError("the page says that it is none of the trials with 4 to 20 poses")
-    both = (stated, "calibrate"), (said, SAME)
-    return percent(share for of, how in both for share in span(_frames(of, how, SWEEPS)))
-
-
-claim(
-    ACCURACY,
-    "interval, and {:.1f} to {:.1f} % of the sweeps. The verdict itself, computed in the trials of "
-    "the comparison, is so in none with 4 to 20 poses, and in {:.0f} to {:.0f} % of the sweeps.",
-    _good,
-)
-
-
-def _smooth(*counts: str) -> tuple[str, ...]:
-    return tuple(f"smooth sweep of {count} s apart" for count in counts)
-
-
-claim(
-    ACCURACY,
-    "the intervals of `calibrate` contain the truth in {:.1f} to {:.1f} % only; in the trials of "
-    "the comparison in {:.1f} to {:.1f} %, and with every frame an image in {:.1f} to {:.1f} %.",
-    lambda: _covered(_smooth(*SMOOTH), "calibrate", SAME, EVERY),
-)
-
-
 def _of_smooth(of: str, frames: str) -> list[float]:
     return percent(_frames(of, frames, _smooth(*SMOOTH)))
 
 
-def _among_good(of: str, frames: str) -> tuple[float, float]:
-    """Of the trials that are called good, those with the truth outside a 99 % interval, %."""
-    outside = _of_smooth(f"{of}_outside_99", frames)
-    return span(
-        100 * one / other for one, other in zip(outside, _of_smooth(of, frames), strict=True)
+for words, of, frames in (
+    ("the verdict is good", "verdict_good_outside_99", SAME),
+    ("the verdict is fair", "verdict_fair_outside_99", SAME),
+    ("good by the stated error alone", "good_outside_99", SAME),
+    ("good with every frame an image", "good_outside_99", EVERY),
+):
+    claim(
+        VERDICT,
+        f"| {words} " + 4 * "| {:.0f} " + "|",
+        lambda of=of, frames=frames: _of_smooth(of, frames),
     )
 
 
+def _good_and_outside() -> list[float]:
+    """Of good verdicts in smooth sweeps; and of the other sweeps."""
+    outside = "verdict_good_outside_99"
+    if any(_frames(outside, SAME, HOLDS)):
+        raise ValueError("the page says that it is so with no held poses")
+    both = zip(_of_smooth(outside, SAME), _of_smooth("verdict_good", SAME), strict=True)
+    return [
+        *span(100 * one / other for one, other in both),
+        *span(percent(_frames(outside, SAME, SWEEPS))),
+    ]
+
+
 claim(
-    ACCURACY,
-    "By the stated error alone {:.1f}, {:.1f}, {:.1f} and {:.1f} % of them (12, 20, 30 and 100 "
-    "images) would be good although the truth is outside a 99 % interval: {:.0f} to {:.0f} % of "
-    "those that would be good.",
-    lambda: (*_of_smooth("good_outside_99", "calibrate"), *_among_good("good", "calibrate")),
-)
-claim(
-    ACCURACY,
-    "The verdict was computed for {:.0f} of each. It is good although the truth is outside in "
-    "{:.0f}, {:.0f}, {:.0f} and {:.0f} % of them, where by the stated error alone it would be in "
-    "{:.0f}, {:.0f}, {:.0f} and {:.0f} %, and with every frame an image in {:.0f}, {:.0f}, {:.0f} "
-    "and {:.0f} %. But of the good verdicts that are left, {:.0f} to {:.0f} % are such; fair ones "
-    "with the truth outside are another {:.0f}, {:.0f}, {:.0f} and {:.0f} %.",
-    lambda: (
-        *set(_frames("trials", SAME)),
-        *_of_smooth("verdict_good_outside_99", SAME),
-        *_of_smooth("good_outside_99", SAME),
-        *_of_smooth("good_outside_99", EVERY),
-        *_among_good("verdict_good", SAME),
-        *_of_smooth("verdict_fair_outside_99", SAME),
-    ),
-)
-claim(
-    ACCURACY,
-    "Where the offsets are drawn anew for every image of such a path, the intervals contain the "
-    "truth in {:.1f} to {:.1f} %.",
-    lambda: _covered(
-        tuple(f"sweep of {count}, 0.5 s apart, offsets anew" for count in (12, 20, 30)), "calibrate"
-    ),
+    VERDICT,
+    "Of the good verdicts that are left, {:.0f} to {:.0f} % have the truth outside. So do not "
+    "calibrate from one short, smooth sweep. In the longer sweeps of the first row the verdict is "
+    "good with the truth outside in {:.0f} to {:.0f} %,",
+    _good_and_outside,
 )
 KEPT, ONE_OF_A_TIME = "2.5, at least 60", "1 of a time"
 
@@ -321,7 +267,7 @@ def _one_of_a_time() -> list[float]:
 
 
 claim(
-    ACCURACY,
+    VERDICT,
     "up to {:.0f} of the 200 recordings are refused, but none with the images that `calibrate` "
     "keeps. In the {:.0f} to {:.0f} recordings that are accepted and solved in all ways, the error "
     "of X's translation (RMS) is {:.1f} to {:.1f} times as large; with all images it is {:.1f} to "
@@ -329,7 +275,7 @@ claim(
     _one_of_a_time,
 )
 claim(
-    ACCURACY,
+    VERDICT,
     "With the images that `calibrate` keeps the intervals contain the truth in {:.1f} to {:.1f} %, "
     "with all images in {:.1f} to {:.1f} %:",
     lambda: percent(
@@ -339,29 +285,19 @@ claim(
         ]
     ),
 )
-claim(
-    ACCURACY,
-    "In the sweeps of the comparison the error of X's translation is {:.2f} to {:.2f} mm (RMS), "
-    "and {:.2f} to {:.2f} mm with every frame an image.",
-    lambda: [
-        *span(_frames("error_mm", SAME, SWEEPS)),
-        *span(_frames("error_mm", EVERY, SWEEPS)),
-    ],
-)
 
 
 # Bounded and uniform offsets.
 claim(
-    ACCURACY,
-    "exceeds the upper end of its 95 % interval in at most {:.1f} % of the recordings (by the "
-    "covariance alone: in up to {:.1f} %).",
+    VERDICT,
+    "At most {:.1f} % of the verdicts are wrong (by the covariance alone: up to {:.1f} %).",
     lambda: [
         max(percent(column("sharp_limits", name)))
         for name in ("good_and_wrong", "stated_good_and_wrong")
     ],
 )
 claim(
-    ACCURACY,
+    VERDICT,
     "another answer in {:.1f} to {:.1f} % of the recordings with the right bound, and in {:.1f} to "
     "{:.1f} % with `--prior uniform`. The right bound does not help: the error is {:.2f} to {:.2f} "
     "times that of the prior `gaussian`, which has no bound. With twice the right bound, it is "
