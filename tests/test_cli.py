@@ -285,7 +285,7 @@ def test_images_are_left_out_by_their_numbers(simulated, capfd):
     recording = jaxcal.load(simulated)
     asked = ("--method", "conventional", "--leave-out", "7-9, 3,8")
     record = json.loads(told(capfd, "calibrate", simulated, "--json", *asked))
-    assert record["warnings"][-1] == "left out as told: images 3, 7 to 9"
+    assert record["warnings"][-1] == "left out as requested: images 3, 7 to 9"
     assert (record["images"], record["images_used"]) == (50, 46)
     mask = np.ones(50, bool)
     mask[[3, 7, 8, 9]] = False

@@ -20,7 +20,7 @@ Every command prints its options with `--help`. `jaxcal` calibrates, `jaxcal-hw`
 | 2 | bad usage or input (nothing was written), or an output cannot be written (other files may have been written); one line says what | the same |
 | 3 | solved, but did not converge, is not determined by the images, or used data in wrong frames or units; of `import` and `segment`: most frames or points were left out | done, but the calibration did not converge |
 | 4 | | a device failed: motion has ended, `--resume` continues; of `check`: a device has a fault |
-| 5 | converged, but less accurate than `--require` (by default fair), or the poses may not be in mm; of `pivot`: the SD of the tip exceeds 1 mm | done, but the calibration is less than fair |
+| 5 | converged, but less accurate than `--require` (by default fair), or the poses may not be in mm; of `pivot`: the SD of the tip exceeds 1 mm; of `compare`: two calibrations differ | done, but the calibration is less than fair |
 | 130 | Ctrl-C | Ctrl-C: motion has ended, `--resume` continues |
 
 `eval "$(_JAXCAL_COMPLETE=bash_source jaxcal)"` in `~/.bashrc` completes commands and options (`zsh_source` and

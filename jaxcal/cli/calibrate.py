@@ -263,7 +263,7 @@ def calibrate(
         with naming(recording):
             images = measured.calibration.without(leave_out)
         measured = replace(measured, calibration=images)
-        notes.append(f"left out as told: images {runs_in_words(leave_out)}")
+        notes.append(f"left out as requested: images {runs_in_words(leave_out)}")
     test_data = None
     if test is not None:
         test_data, told = segmented(load(test))

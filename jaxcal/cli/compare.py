@@ -46,7 +46,7 @@ def compare(
     is 5 if two of them are farther apart than 95 % of such pairs would be by their covariances; of
     more calibrations, if two are farther apart than the farthest two would be in 95 % of cases. Few
     images, which leave the size of the errors uncertain, are allowed for. If the verdict of one
-    expects larger errors than its covariance says, the factor is told.
+    expects larger errors than its covariance says, the factor is printed.
     """
     import numpy as np
 
