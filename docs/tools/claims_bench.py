@@ -165,7 +165,9 @@ for words, share, form in (
     claim(
         PLANNED,
         f"| {words} | {{:.0f}} to {{:.0f}} % | {form} % |",
-        lambda share=share: percent((*_filled("told_of", share), *_filled("good_and_wrong", share))),
+        lambda share=share: percent(
+            (*_filled("told_of", share), *_filled("good_and_wrong", share))
+        ),
     )
 claim(
     PLANNED,

@@ -69,30 +69,30 @@ claim(
 )
 
 
-def _accelerator(method: str, prior: str, images: int = 20) -> float:
+def _accelerator(method: str, prior: str, images: int) -> float:
     found = only("accelerator", "problems_per_s", method=method, prior=prior, images=str(images))
     return round(found, -3)
 
 
 claim(
     SPEED,
-    "batches of {:,.0f} problems of {:.0f} images in float64 on an NVIDIA H100: {:,.0f} "
-    "conventional calibrations a second, {:,.0f} self-tuned Gaussian ones, {:,.0f} with prior "
-    "auto; with {:.0f} images {:,.0f}, {:,.0f} and {:,.0f}. That is {:.1f} to {:.1f} times what "
-    "all {:.0f} cores",
-    lambda: (
-        max(column("accelerator", "problems")),
-        min(column("accelerator", "images")),
-        _accelerator("conventional", "auto"),
-        _accelerator("joint", "gaussian"),
-        _accelerator("joint", "auto"),
-        max(column("accelerator", "images")),
-        _accelerator("conventional", "auto", 50),
-        _accelerator("joint", "gaussian", 50),
-        _accelerator("joint", "auto", 50),
-        *span(column("accelerator", "ratio")),
-        max(column("accelerator", "cores")),
-    ),
+    "batches of {:,.0f} problems in float64",
+    lambda: [max(column("accelerator", "problems"))],
+)
+for images in (20, 50):
+    claim(
+        SPEED,
+        f"| {images} " + 3 * "| {:,.0f} " + "|",
+        lambda images=images: [
+            _accelerator("conventional", "auto", images),
+            _accelerator("joint", "gaussian", images),
+            _accelerator("joint", "auto", images),
+        ],
+    )
+claim(
+    SPEED,
+    "That is {:.1f} to {:.1f} times what all {:.0f} cores",
+    lambda: (*span(column("accelerator", "ratio")), max(column("accelerator", "cores"))),
 )
 OURS, FAR, FITTED = "calibrate_batch", "20 degrees, 20 mm off", "conventional fit"
 
@@ -104,57 +104,64 @@ def _over(peer: str, start: str = FAR, *, of: str = "solver_peers", which: str =
 
 claim(
     SPEED,
-    "solves {:,.0f} problems a second. That is {:.1f} times as many as Ceres (DENSE_SCHUR), "
-    "{:.1f} times its TinySolver, {:.0f} times scipy with exact Jacobians and {:.0f} times "
-    "optimistix;",
-    lambda: (
+    "solves {:,.0f} problems a second.",
+    lambda: [
         round(
             only("solver_peers", "solves_per_s_median", solver=f"{OURS}, given SDs", images="50"),
             -2,
-        ),
-        _over("Ceres DENSE_SCHUR, 1e-9"),
-        _over("Ceres TinySolver, 1e-9"),
-        _over("scipy lm"),
-        _over("optimistix LM, vmapped"),
-    ),
+        )
+    ],
 )
+for words, peer in (("Ceres (DENSE_SCHUR)", "DENSE_SCHUR"), ("Ceres' TinySolver", "TinySolver")):
+    claim(
+        SPEED,
+        f"| {words} | {{:.1f}} | {{:.1f}} |",
+        lambda peer=peer: (
+            _over(f"Ceres {peer}, 1e-9"),
+            _over(f"Ceres {peer}, 1e-9, from the conventional fit", FITTED),
+        ),
+    )
+for words, peer in (
+    ("scipy with exact Jacobians", "scipy lm"),
+    ("optimistix", "optimistix LM, vmapped"),
+):
+    claim(SPEED, f"| {words} | {{:.0f}} | |", lambda peer=peer: [_over(peer)])
 claim(
     SPEED,
-    "Ceres (DENSE_SCHUR) took {:.1f} times as long (single rounds: {:.1f} to {:.1f})",
+    "(DENSE_SCHUR) took {:.1f} times as long (single rounds: {:.1f} to {:.1f})",
     lambda: [
         _over("Ceres DENSE_SCHUR, 1e-9", of="solver_peers_avx512", which=which)
         for which in ("median", "min", "max")
     ],
 )
-claim(
-    SPEED,
-    "Ceres takes {:.1f} times as long as all of `calibrate_batch` (TinySolver: {:.1f}).",
-    lambda: (
-        _over("Ceres DENSE_SCHUR, 1e-9, from the conventional fit", FITTED),
-        _over("Ceres TinySolver, 1e-9, from the conventional fit", FITTED),
-    ),
-)
-claim(
-    SPEED,
-    "A problem takes {:.0f} us with self-tuned SDs, {:.0f} us with prior auto, {:.0f} us by the "
-    "alternation, {:.0f} us with bounded offsets, {:.0f} us with pixels of unknown size, and "
-    "{:.0f} us on the times of flight",
-    lambda: [
-        only("solver_peers", "us_per_problem", solver=f"{OURS}, {method}", images="50")
-        for method in (
-            "REML", "auto", "alternation", "bounded", "pixels, unknown scale", "channels"
-        )
-    ],
-)  # fmt: skip
-claim(
-    SPEED,
-    "It takes {:.1f} s of CPU for the conventional method, {:.1f} s with given SDs, {:.1f} s with "
-    "self-tuned SDs and {:.0f} s with prior auto.",
-    lambda: [
-        only("public_calls", "median", part="first call", method=method, unit="CPU s")
-        for method in ("conventional", "given SDs", "REML", "auto")
-    ],
-)
+
+
+def _us(method: str) -> float:
+    return only("solver_peers", "us_per_problem", solver=f"{OURS}, {method}", images="50")
+
+
+def _first_call(method: str) -> float:
+    return only("public_calls", "median", part="first call", method=method, unit="CPU s")
+
+
+for words, method in (
+    ("given SDs", "given SDs"),
+    ("self-tuned SDs", "REML"),
+    ("prior auto", "auto"),
+):
+    claim(
+        SPEED,
+        f"| {words} | {{:.0f}} us | {{:.1f}} s |",
+        lambda method=method: (_us(method), _first_call(method)),
+    )
+claim(SPEED, "| conventional | | {:.1f} s |", lambda: [_first_call("conventional")])
+for words, method in (
+    ("alternation", "alternation"),
+    ("bounded offsets", "bounded"),
+    ("pixels of unknown size", "pixels, unknown scale"),
+    ("times of flight of 32 elements", "channels"),
+):
+    claim(SPEED, f"| {words} | {{:.0f}} us | |", lambda method=method: [_us(method)])
 claim(
     SPEED,
     "The results agree to {:.0e} mm. The first call takes {:.0f} to {:.0f} s",

@@ -46,6 +46,7 @@ claim(
     ),
 )
 
+
 # Stated errors.
 def _scales(of: str, method: str, prior: str) -> tuple[float, float]:
     where = {"unknowns": "scale", "method": method, "prior": prior}

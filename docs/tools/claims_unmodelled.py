@@ -29,9 +29,7 @@ for what, of in (
 claim(
     VERDICT,
     "| an outlier, uniform and normal offsets " + 3 * "| {:.1f} to {:.1f} " + "|",
-    lambda: [
-        share for images in COUNTS for share in span(_outliers(images, "uniform", "normal"))
-    ],
+    lambda: [share for images in COUNTS for share in span(_outliers(images, "uniform", "normal"))],
 )
 claim(
     VERDICT,
