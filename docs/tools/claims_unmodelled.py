@@ -151,9 +151,9 @@ claim(
     "Of the clean ones {:.1f} to {:.1f} % are reported to have such an error. The sound speed of "
     "the curved array, 3 % too high, is named in all {:.0f}. A slip, a step, a displaced target, a "
     "distortion and two targets are named in {:.0f} to {:.0f} % of the recordings with 30 and 60 "
-    "images, wrong markers in {:.0f} to {:.0f} %. Over all faults, at most {:.0f} % of the verdicts "
-    "are wrong (by the covariance alone: up to {:.0f} %). Targets 6 mm to one side of the plane are hardly noticed "
-    "with 30 and 60 images ({:.0f} to {:.0f} %):",
+    "images, wrong markers in {:.0f} to {:.0f} %. Over all faults, at most {:.0f} % of the "
+    "verdicts are wrong (by the covariance alone: up to {:.0f} %). Targets 6 mm to one side of the "
+    "plane are hardly noticed with 30 and 60 images ({:.0f} to {:.0f} %):",
     lambda: (
         *_of_times("told_of", "none"),
         _all_of("unmodelled_times", "right", fault="speed"),
