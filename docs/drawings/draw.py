@@ -144,7 +144,7 @@ def frames() -> Canvas:
     canvas.line([(28, 444), (692, 444)], "thin grey")
     canvas.lines(
         (28, 472),
-        "Bᵢ: probe to tracker, told by the tracker.   X: image to probe, the calibration.\n"
+        "Bᵢ: probe to tracker, measured by the tracker.   X: image to probe, the calibration.\n"
         "c: the target.   Every image says   c = Bᵢ X qᵢ.\n"
         "It shows the lateral position and the range of qᵢ, and not its offset y.",
         "text",
