@@ -150,6 +150,7 @@ SETTINGS: dict[str, tuple[str, ...]] = {
     ),
     SPEED: (
         "AVX-512",
+        "Zen 4",
         "to segment a trial of 50 x 128",
         "with 50 images",
         "start 20 degrees and 20 mm off",
