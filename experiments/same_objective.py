@@ -193,7 +193,7 @@ def main() -> None:
 
     fit, _ = solve()
     joint_times = [solve()[1] for _ in range(3)]
-    singular, condition = spectra(np.asarray(fit.information), problems)
+    singular, condition = spectra(np.asarray(fit.linearisation.information), problems)
 
     def segment(problems: Problem, starts: Parameters, bound: Array, rounds: Array) -> Segment:
         done = advance(problems, starts, bound, TOLERANCE, TOLERANCE, rounds)
@@ -214,7 +214,8 @@ def main() -> None:
         print(f"alternation: {rounds} rounds, {finished.sum()} of {count} stopped, {seconds:.1f} s")
     costs = np.array(costs)
 
-    joint_cost = np.asarray(fit.cost)
+    ended = fit.convergence
+    joint_cost = np.asarray(ended.cost)
     squares = np.asarray(jnp.sum(problems.measurements**2, axis=(1, 2)))
     allowed = costs[-1] * (1 + 1e-8) + 1e-12 * squares
     worse = joint_cost > allowed
@@ -244,7 +245,7 @@ def main() -> None:
          "interval_of_minimisers"],
         (
             [k, *settings[k].tolist(), float(bounds[k]), float(joint_cost[k]),
-             int(fit.iterations[k]), float(fit.stationarity[k]), float(costs[-1, k]),
+             int(ended.iterations[k]), float(ended.stationarity[k]), float(costs[-1, k]),
              bool(finished[k]), int(rounds_needed[k]), bool(singular[k])]
             for k in range(count)
         ),
@@ -255,12 +256,12 @@ def main() -> None:
          "observable", "angle_between_rad"],
         peers,
     )  # fmt: skip
-    iterations = np.asarray(fit.iterations)
+    iterations = np.asarray(ended.iterations)
     summary = [
         ("problems", count),
         ("joint objective above alternation's x (1 + 1e-8) + 1e-12 sum r^2", int(worse.sum())),
         ("joint objective lower by more than that", int(better.sum())),
-        ("joint scaled KKT residual, largest", float(fit.stationarity.max())),
+        ("joint scaled KKT residual, largest", float(ended.stationarity.max())),
         ("joint iterations, median", float(np.median(iterations))),
         ("joint iterations, largest", int(iterations.max())),
         ("joint time per problem (us), median of 3", 1e6 * float(np.median(joint_times)) / count),

@@ -64,8 +64,8 @@ def run_cell(cell: int, kind: str, noise: float, trials: int) -> dict[str, np.nd
     }
     tests = drawn.test_poses, drawn.test_points
     out = {f"rp_{name}": precision(r.image_to_probe, *tests) for name, r in results.items()}
-    found = results["estimated"]
-    out["converged"] = np.asarray(found.converged)
+    estimated = results["estimated"]
+    out["converged"], found = np.asarray(estimated.converged), estimated.medium
     for name, value, sd, truth in (
         ("speed", found.sound_speed_m_s, found.sound_speed_sd_m_s, TRUE_M_S),
         ("delay", found.delay_s, found.delay_sd_s, DELAY_S),

@@ -25,9 +25,9 @@ from hw.planning.poses import Extent, plan_poses
 from hw.planning.scene import Scene
 from hw.runtime.rigid import looking_rotation
 from jaxcal import Images, segment
+from jaxcal.data.names import SegmentationMethod
 from jaxcal.data.poses import rotations_from_vectors
 from jaxcal.data.probe import L14_5
-from jaxcal.data.segmentation.segment import Method
 
 FWHM = float(np.sqrt(8 * np.log(2.0)))
 """Full width at half maximum of a Gaussian over its SD."""
@@ -386,7 +386,7 @@ def _with_times(drawn: Drawn, tank: Tank, seed: tuple[int, ...], trials: range) 
     sets = dict(drawn.sets)
     sets["Auto-AE, shortest"] = sets["Auto-AE"]
     # OH is heard with more noise, which moves its amplitudes and not its times (hw/bench).
-    automatic: tuple[tuple[str, Method, int], ...] = (
+    automatic: tuple[tuple[str, SegmentationMethod, int], ...] = (
         ("Auto-AE", "least-squares", 1),
         ("Auto-AE, shortest", "shortest", 1),
         ("OH", "least-squares", 2),

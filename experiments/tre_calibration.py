@@ -107,10 +107,11 @@ def actual_errors(result: Calibration, truth: np.ndarray, points: np.ndarray) ->
         lateral, axial = (np.asarray(result.scale_mm_per_px) / SPACING_MM).T
         truth = truth.copy()
         truth[:, :3, 3] -= LEFT_MM * truth[:, :3, 0]
-    if result.sound_speed_m_s is not None:
+    found = result.medium
+    if found.sound_speed_m_s is not None:
         nominal = L14_5.sound_speed_m_s
-        axial = np.asarray(result.sound_speed_m_s) / nominal
-        delay = np.zeros_like(one) if result.delay_s is None else np.asarray(result.delay_s)
+        axial = np.asarray(found.sound_speed_m_s) / nominal
+        delay = np.zeros_like(one) if found.delay_s is None else np.asarray(found.delay_s)
         shift = (delay - L14_5.delay_s) * 1e3 * nominal
 
     def placed(transform: np.ndarray, x: np.ndarray, z: np.ndarray) -> np.ndarray:

@@ -302,12 +302,14 @@ def test_whitened_errors_are_those_of_the_solve(tracker_sd):
     # With a covariance for each image, and too few to be examined for correlated errors.
     recording = jaxcal.simulate_recording(jaxcal.Protocol(images=12), 3)
     result = jaxcal.calibrate(recording, "joint", "gaussian", **given)
-    assert float(result.cost) == pytest.approx(sum_of_squares(result, **given), rel=1e-9)
+    assert float(result.convergence.cost) == pytest.approx(
+        sum_of_squares(result, **given), rel=1e-9
+    )
     alone = batch_of_one(result.numpy())
     whitened = influences.whitened_errors(alone)
     information = np.einsum("mkp,mkq->pq", whitened.rows, whitened.rows)
     size = np.sqrt(np.diagonal(information))
-    stated = np.asarray(result.information)
+    stated = np.asarray(result.linearisation.information)
     np.testing.assert_allclose(information / np.outer(size, size), stated / np.outer(size, size),
                                atol=1e-12)  # fmt: skip
     gradient = np.einsum("mkp,mk->p", whitened.rows, whitened.errors)

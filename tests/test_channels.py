@@ -103,12 +103,13 @@ def test_sound_speed_and_delay_are_estimated_along(probe):
     result = jaxcal.calibrate(off, estimate=("sound-speed", "delay"), prior="gaussian")
     assert result.status == "converged"
     assert result.data == "channels"
-    assert result.sound_speed_m_s is not None
-    assert result.sound_speed_sd_m_s is not None
-    assert result.delay_s is not None
-    assert result.delay_sd_s is not None
-    assert abs(result.sound_speed_m_s - 1520.0) < 3 * result.sound_speed_sd_m_s < 3.0
-    assert abs(result.delay_s - 0.5e-6) < 3 * result.delay_sd_s < 0.15e-6
+    medium = result.medium
+    assert medium.sound_speed_m_s is not None
+    assert medium.sound_speed_sd_m_s is not None
+    assert medium.delay_s is not None
+    assert medium.delay_sd_s is not None
+    assert abs(medium.sound_speed_m_s - 1520.0) < 3 * medium.sound_speed_sd_m_s < 3.0
+    assert abs(medium.delay_s - 0.5e-6) < 3 * medium.delay_sd_s < 0.15e-6
     # In a single experiment either may be better by chance.
     several = [data, *(recording(probe, seed=seed) for seed in (4, 5, 6, 7, 8))]
     estimated, known, wrong = [], [], []
@@ -132,8 +133,8 @@ def test_what_points_cannot_tell_is_said_or_refused():
         assert "delay" in delay.observability["weakest_direction"]
     speed = jaxcal.calibrate(points, estimate=("sound-speed",), prior="gaussian")
     assert speed.status == "converged"
-    assert speed.sound_speed_sd_m_s is not None
-    assert float(speed.sound_speed_sd_m_s) < 20.0
+    assert speed.medium.sound_speed_sd_m_s is not None
+    assert float(speed.medium.sound_speed_sd_m_s) < 20.0
     pixels = replace(points, pixels=True)
     with pytest.raises(InputError, match="one and the same factor"):
         jaxcal.calibrate(pixels, estimate=("scale", "sound-speed"))

@@ -570,7 +570,7 @@ def test_the_record_tells_what_is_proved(crosswire):
     result = solved.numpy()
     found = certificate_record(result)
     assert found["certified"] is True
-    assert found["gap_mm2"] < 1e-9 * float(result.cost)
+    assert found["gap_mm2"] < 1e-9 * float(result.convergence.cost)
     assert certificate_words(found) == (
         "conventional fit certified: no transform fits Eq. 7 better"
     )

@@ -178,8 +178,9 @@ def test_the_command_tells_who_agrees(files, capsys):
     printed = capsys.readouterr().out
     page = " ".join(printed.split())
     assert "2 of 3 pairs are farther apart than 95 %" in page
-    # Long paths are folded, not cut off, or those of one folder look alike.
-    assert "…" not in printed
+    # Long paths stay whole, so that they can be copied.
+    assert printed.splitlines()[:3] == [f"{k}: {name}" for k, name in enumerate(files, start=1)]
+    assert re.search(r"^ *2 +3 .* no$", printed.replace(" \n", "\n"), re.M)
     assert main(["compare", *files, *PIXELS, "--json"]) == 5
     pairs = json.loads(capsys.readouterr().out)["pairs"]
     assert [pair["agree"] for pair in pairs] == [True, False, False]
@@ -221,10 +222,8 @@ def test_a_verdict_that_expects_larger_errors_is_told(files, capsys):
 
 def test_lengths_that_may_be_in_another_unit_are_told_wherever_they_are_used(tmp_path, capsys):
     doubted, other = str(tmp_path / "doubted.json"), str(tmp_path / "other.json")
-    for name in (doubted, other):
-        ImageTransform(place(), SCALE).save(name)
-    record = json.loads(Path(doubted).read_text())
-    Path(doubted).write_text(json.dumps(record | {"doubtful_unit": "may be in cm"}))
+    ImageTransform(place(), SCALE, doubtful_unit="may be in cm").save(doubted)
+    ImageTransform(place(), SCALE).save(other)
     for arguments, where in (
         (["compare", doubted, other, *PIXELS], 0),
         (["apply", doubted, "--pixel", "1", "2"], 1),

@@ -87,8 +87,8 @@ def test_every_number_is_the_engines(estimate):
             least = 0.01 if name == "elevation" else 1e-12
             size = max(least, np.abs(wanted[name]).max(initial=0.0))
             np.testing.assert_allclose(value, wanted[name], rtol=0, atol=1e-8 * size, err_msg=name)
-        assert int(found.iterations) == 0
-        assert float(found.stationarity) < 1e-6
+        assert int(found.convergence.iterations) == 0
+        assert float(found.convergence.stationarity) < 1e-6
 
 
 def test_sound_speed_is_the_engines():
@@ -99,12 +99,16 @@ def test_sound_speed_is_the_engines():
     found = jaxcal.calibrate(one, METHOD, estimate=("sound-speed",), data="points")
     batch = jaxcal.stack([one])
     expected = jaxcal.calibrate_batch(batch, METHOD, estimate=("sound-speed",), data="points")[0]
-    assert int(found.iterations) == 0 < int(expected.iterations)
-    for name in ("sound_speed_m_s", "sound_speed_sd_m_s", "covariance", "image_to_probe"):
-        np.testing.assert_allclose(
-            getattr(found, name), getattr(expected, name), rtol=1e-7, atol=1e-9, err_msg=name
-        )
-    assert found.sound_speed_prior_m_s is None
+    assert int(found.convergence.iterations) == 0 < int(expected.convergence.iterations)
+    for one, other, names in (
+        (found, expected, ("covariance", "image_to_probe")),
+        (found.medium, expected.medium, ("sound_speed_m_s", "sound_speed_sd_m_s")),
+    ):
+        for name in names:
+            np.testing.assert_allclose(
+                getattr(one, name), getattr(other, name), rtol=1e-7, atol=1e-9, err_msg=name
+            )
+    assert found.medium.sound_speed_prior_m_s is None
 
 
 def test_the_sound_speed_of_pixels_counts_from_that_of_scanners():
@@ -115,7 +119,7 @@ def test_the_sound_speed_of_pixels_counts_from_that_of_scanners():
         np.asarray(drawn.poses), stretched, kind="pixel", spacing_mm=(0.2, 0.2)
     )
     found = jaxcal.calibrate(pixels, METHOD, estimate=("sound-speed",))
-    assert found.sound_speed_m_s == pytest.approx(1482.0, abs=0.1)
+    assert found.medium.sound_speed_m_s == pytest.approx(1482.0, abs=0.1)
     assert found.image_transform().range_factor == pytest.approx(1482 / 1540, rel=1e-4)
 
 
@@ -132,7 +136,7 @@ def test_where_the_engine_stays():
     assert closed_form(one, options=Options(precision="float32")) is None
     assert closed_form(one, robust=True) is None
     # Under jit the closed form could not be numpy's.
-    lowered = jax.jit(lambda p: jaxcal.calibrate(p, METHOD).iterations).lower(one)
+    lowered = jax.jit(lambda p: jaxcal.calibrate(p, METHOD).convergence.iterations).lower(one)
     assert "while" in lowered.as_text()
 
 
@@ -162,8 +166,9 @@ def test_a_weakly_known_direction_is_said():
 
 def test_the_trace_is_one_value():
     found = jaxcal.calibrate(of_18(1), METHOD, options=Options(trace=3))
-    np.testing.assert_array_equal(np.isnan(found.trace), [False, True, True])
-    assert float(found.trace[0]) == float(found.cost)
+    ended = found.convergence
+    np.testing.assert_array_equal(np.isnan(ended.trace), [False, True, True])
+    assert float(ended.trace[0]) == float(ended.cost)
 
 
 # Without JAX

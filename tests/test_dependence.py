@@ -371,7 +371,8 @@ def test_leaving_an_image_out_is_foretold_where_errors_are_alike(correlated):
 
 
 def test_the_sound_speed_is_as_uncertain_as_its_covariance_says(correlated):
-    speed, sd = correlated[0].sound_speed_m_s, correlated[0].sound_speed_sd_m_s
+    found = correlated[0].medium
+    speed, sd = found.sound_speed_m_s, found.sound_speed_sd_m_s
     whole = np.asarray(correlated[0].unknowns_covariance)
     assert float(sd) == pytest.approx(float(speed) * whole[9, 9] ** 0.5, rel=1e-9)
     told = further_unknowns(correlated[0].numpy())["sound-speed"]

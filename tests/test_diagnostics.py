@@ -165,7 +165,7 @@ def test_reading_diagnostics_under_jit_is_an_error_that_says_so():
                 lambda p, name=name: getattr(jaxcal.calibrate(p, "conventional"), name), there
             )
     found = jax.eval_shape(
-        lambda p: (lambda c: (c.status_code, c.covariance, c.information))(
+        lambda p: (lambda c: (c.status_code, c.covariance, c.linearisation.information))(
             jaxcal.calibrate(p, "conventional")
         ),
         there,

@@ -241,6 +241,7 @@ def test_a_unit_in_doubt_leaves_the_error_unknown_until_it_is_stated(slips):
         record = calibration_record(result, recording)
         doubted = factor < 1
         assert (record["doubtful_unit"] is not None) == doubted
+        assert result.image_transform().doubtful_unit == record["doubtful_unit"]
         assert (record["verdict"] == "uncertain") == doubted
         assert (verdict_code(record) == ExitCode.UNCERTAIN) == doubted
         assert (record["tre"] is None) == doubted

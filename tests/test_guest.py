@@ -265,7 +265,7 @@ def test_the_documentations_examples_with_another_solver_and_on_another_problem(
     names: dict[str, object] = {}
     exec(compile(dogleg, "own-solver.md", "exec"), names)
     assert names["result"].status == "converged"
-    assert names["result"].stationarity < 1e-8
+    assert names["result"].convergence.stationarity < 1e-8
     exec(compile(pieces, "own-solver.md", "exec"), names)
 
     def cost(tangent):

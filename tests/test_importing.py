@@ -389,8 +389,10 @@ def test_only_some_rows_of_a_table(tmp_path):
     pair = tmp_path / "poses.txt", tmp_path / "points.txt"
     np.savetxt(pair[0], POSES.reshape(-1, 16))
     np.savetxt(pair[1], PIXELS)
-    with pytest.raises(InputError, match="--frames does not go with a pair of text files"):
-        import_files(pair, ImportOptions(frames=(0, 1, 2, 3)))
+    images = import_files(pair, ImportOptions(frames=(1, 2, 3, 5))).recording.calibration
+    np.testing.assert_array_equal(images.measurements, np.array(PIXELS)[[1, 2, 3, 5]])
+    np.testing.assert_allclose(images.poses, POSES[[1, 2, 3, 5]], atol=1e-12)
+    np.testing.assert_array_equal(images.frame, [1, 2, 3, 5])
 
 
 def _named(names, columns):

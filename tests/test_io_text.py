@@ -301,6 +301,17 @@ def test_the_header_of_a_ros_message_gives_the_time(tmp_path):
     path.write_text("\n".join([",".join(names), *rows]))
     with pytest.raises(FormatError, match="columns 1 and 3 are both time"):
         read_pose_table(path)
+    # As bagpy writes it.
+    names[:4] = "Time", "header.stamp.secs", "header.stamp.nsecs", "header.frame_id"
+    names[4:] = [name.removeprefix("field.") for name in names[4:]]
+    rows = [f"{start + 9},{start + k},{k}00000000,camera,1,2,{k},0,0,0,1" for k in range(6)]
+    path.write_text("\n".join([",".join(names), *rows]))
+    table = read_pose_table(path, pose_units="m")
+    np.testing.assert_allclose(table.time, start + 1.1 * np.arange(6), atol=1e-6)
+    assert table.notes == [f"{path}: columns that are not read: 'Time', 'header.frame_id'"]
+    path.write_text("\n".join([",".join(["frame", *names[1:]]), *rows]).replace(".secs", ".seq"))
+    with pytest.raises(FormatError, match="nanoseconds of a time, but not its seconds"):
+        read_pose_table(path)
 
 
 def test_a_header_of_points_that_are_named_as_positions(tmp_path):

@@ -59,12 +59,12 @@ def same_objective():
 def test_joint_reaches_the_alternations_objective_at_kkt_precision(same_objective):
     problems, joint, alternation = same_objective
     squares = np.sum(np.asarray(problems.measurements) ** 2, axis=(1, 2))
-    allowed = np.asarray(alternation.cost) * (1 + 1e-8) + 1e-12 * squares
-    assert (np.asarray(joint.cost) <= allowed).all()
-    assert float(jnp.max(joint.stationarity)) <= 1e-8
+    allowed = np.asarray(alternation.convergence.cost) * (1 + 1e-8) + 1e-12 * squares
+    assert (np.asarray(joint.convergence.cost) <= allowed).all()
+    assert float(jnp.max(joint.convergence.stationarity)) <= 1e-8
     assert np.asarray(joint.converged).all()
     # It does so in a fraction of the rounds, and never leaves the bounds.
-    assert np.sum(joint.iterations) < 0.3 * np.sum(alternation.iterations)
+    assert np.sum(joint.convergence.iterations) < 0.3 * np.sum(alternation.convergence.iterations)
     assert (np.abs(joint.elevation) <= np.asarray(problems.max_elevation) + 1e-12).all()
 
 
@@ -92,8 +92,10 @@ def test_joint_agrees_with_scipy_where_observable(same_objective):
             bounds=(-bound, bound), x_scale="jac", ftol=1e-15, xtol=1e-15, gtol=1e-15,
             max_nfev=2000,
         )  # fmt: skip
-        assert float(result.cost) <= 2 * fit.cost * (1 + 1e-8) + 1e-9
-        if np.isfinite(result.covariance).all() and float(result.cost) > 2 * fit.cost * (1 - 1e-6):
+        assert float(result.convergence.cost) <= 2 * fit.cost * (1 + 1e-8) + 1e-9
+        if np.isfinite(result.covariance).all() and float(
+            result.convergence.cost
+        ) > 2 * fit.cost * (1 - 1e-6):
             theirs = moved_to(start, jnp.asarray(fit.x[:9])).matrix()
             assert angle(theirs, result.image_to_probe) < 1e-4
             compared += 1
@@ -190,7 +192,7 @@ def test_sds_beside_own_covariances_are_found(beside_own_covariances):
     """They are the units of the residuals as well, which must not stop the descent."""
     result = beside_own_covariances[:200]
     assert np.mean(np.asarray(result.converged)) >= 0.99
-    assert np.median(result.variance_rounds) < 20
+    assert np.median(result.convergence.variance_rounds) < 20
 
 
 def test_given_covariances_set_the_weights(beside_own_covariances, self_tuned):
@@ -218,7 +220,7 @@ def test_conventional_is_scipys_least_squares():
         jac=lambda u: np.asarray(slope(jnp.asarray(u))),  # pyright: ignore[reportArgumentType]
         method="lm", xtol=1e-15, ftol=1e-15, gtol=1e-15,
     )  # fmt: skip
-    assert float(result.cost) == pytest.approx(2 * fit.cost, rel=1e-12)
+    assert float(result.convergence.cost) == pytest.approx(2 * fit.cost, rel=1e-12)
     np.testing.assert_allclose(fit.x, 0, atol=1e-5)
 
 
@@ -231,5 +233,5 @@ def test_elevation_is_where_the_target_is_in_the_image(single):
         atol=1e-12,
     )
     np.testing.assert_allclose(
-        result.rms, np.sqrt(float(result.cost) / 30), rtol=1e-12
+        result.rms, np.sqrt(float(result.convergence.cost) / 30), rtol=1e-12
     )  # Eq. 7's residuals are the in-plane ones

@@ -96,15 +96,15 @@ def test_points_on_a_line_leave_a_rotation_open():
 def test_a_start_drowned_in_noise_is_searched_for():
     data = problem(17, images=4, elevation_mm=5.0, noise_mm=10.0)
     result = jaxcal.calibrate(data, method="conventional")
-    assert result.searched_start
-    assert any("a start was found by trying" in warning for warning in result.warnings)
+    assert result.convergence.searched_start
+    assert any("descents from many rotations" in warning for warning in result.warnings)
     # Noise of this size may well have moved the minimum; none better is near the truth, though.
     truth = jaxcal.simulate_recording(
         jaxcal.Protocol(images=4, elevation_mm=5.0, noise_mm=10.0), 17
     ).truth
-    assert float(result.cost) <= float(cost_from(data, truth.image_to_probe, truth.point)) * (
-        1 + 1e-9
-    )
+    assert float(result.convergence.cost) <= float(
+        cost_from(data, truth.image_to_probe, truth.point)
+    ) * (1 + 1e-9)
 
 
 @jax.jit

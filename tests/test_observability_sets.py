@@ -82,7 +82,7 @@ def test_the_conventional_method_arrives_or_says_why_not(kind, seed, elevation, 
     allowed = ("unobservable",) if posed.deficient else ("converged", "unobservable")
     assert result.status in allowed
     if not posed.deficient:
-        assert int(result.iterations) < 100
+        assert int(result.convergence.iterations) < 100
 
 
 def test_no_image_of_a_weak_or_degenerate_set_is_taken_for_wrong():
@@ -182,7 +182,7 @@ def test_two_thousand_weak_sets_by_the_conventional_method():
     one = jax.jit(lambda p: jaxcal.calibrate(p, "conventional", robust=False))
     each = jax.lax.map(one, data)
     # A batch descends as one traced problem does, so the slow ones here are its slow ones.
-    slowest = np.argsort(np.asarray(each.iterations))[-128:]
+    slowest = np.argsort(np.asarray(each.convergence.iterations))[-128:]
     hardest = jax.tree.map(lambda leaf: leaf[slowest], data)
     batch = jaxcal.calibrate_batch(hardest, "conventional")
     np.testing.assert_array_equal(batch.status, np.asarray(each.status)[slowest])

@@ -20,6 +20,7 @@ from jaxcal.report.page import page, write_page
 from jaxcal.report.paragraphs import as_html
 from jaxcal.report.record import calibration_record
 from jaxcal.result.saved import load_calibration
+from jaxcal.runtime.colours import BLUE, GREEN, ORANGE
 
 sys.path.insert(0, str(Path(__file__).parent / "hw"))
 from browser import browsing, open_page
@@ -224,7 +225,7 @@ def test_many_images_stay_small(result, recording):
     rng = np.random.default_rng(0)
     for count in (5000, 20_000):
         values = rng.normal(size=count)
-        drawn = svg.series([("offset (mm)", range(count), values, svg.BLUE)],
+        drawn = svg.series([("offset (mm)", range(count), values, BLUE)],
                            range(0, count, 3), "many", spread=values**2)  # fmt: skip
         assert len(drawn) < 6e5
     shown = svg.drawn(values, np.array([7, 19_999]))
@@ -245,7 +246,7 @@ def test_many_images_stay_small(result, recording):
 @pytest.mark.parametrize("largest", [0.2, 0.45, 0.8, 0.99, 1.3, 2.1, 70.0])
 def test_axes_of_images_tell_a_scale_and_only_images_that_exist(largest):
     values = [-0.4 * largest, 0.0, 0.9 * largest, largest]
-    drawn = svg.series([("x (mm)", [0, 1, 2, 3], values, svg.BLUE)], [], "few", height=78.0)
+    drawn = svg.series([("x (mm)", [0, 1, 2, 3], values, BLUE)], [], "few", height=78.0)
     down = re.findall(r'text-anchor="end" class="tick">([^<]*)<', drawn)
     along = re.findall(r'text-anchor="middle" class="tick">([^<]*)<', drawn)
     assert len(down) >= 2
@@ -268,7 +269,7 @@ def test_error_map_of_any_size_tells_its_scales(wide, deep):
 
 @pytest.mark.parametrize("largest", [3e-6, 0.0011, 0.012, 0.3, 4000.0])
 def test_a_label_has_room_beside_the_numbers_of_its_axis(largest):
-    drawn = svg.series([("x (mm)", [0, 1], [-largest, largest], svg.BLUE)], [], "few")
+    drawn = svg.series([("x (mm)", [0, 1], [-largest, largest], BLUE)], [], "few")
     label = float(re.findall(r'<text x="([0-9.]+)"[^>]*class="label" transform', drawn)[0])
     ends = re.findall(r'<text x="([0-9.]+)"[^>]*text-anchor="end" class="tick">([^<]*)<', drawn)
     # 9 px type of 0.64 em a digit, as wide as any, and half of a label of 10 px.
@@ -281,7 +282,7 @@ def test_shares_are_readable_on_every_colour():
         parts = [int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5)]
         return np.dot([0.2126, 0.7152, 0.0722], [((v + 0.055) / 1.055) ** 2.4 for v in parts])
 
-    kinds = [(colour, 1 / 3, colour) for colour in (svg.BLUE, svg.GREEN, svg.ORANGE)]
+    kinds = [(colour, 1 / 3, colour) for colour in (BLUE, GREEN, ORANGE)]
     inks = re.findall(r"fill:(#[0-9a-f]{3})", svg.stacked([("error", kinds)], "shares"))
     for (_, _, colour), ink in zip(kinds, inks, strict=True):
         dark, light = sorted((luminance(colour), {"#000": 0.0, "#fff": 1.0}[ink]))

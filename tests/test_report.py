@@ -468,7 +468,7 @@ def test_convergence_figure_shows_the_excess_over_the_best():
 
 def test_bounded_curves_end_in_one_minimum(recording, result):
     joint, alternating = bounded_curves(jaxcal.Problem.from_recording(recording))
-    trace = np.asarray(result.trace)
+    trace = np.asarray(result.convergence.trace)
     np.testing.assert_array_equal(joint.objective[-len(trace) :], trace)
     values = [curve.objective[np.isfinite(curve.objective)] for curve in (joint, alternating)]
     for curve in values:

@@ -215,7 +215,7 @@ def test_derivatives_are_finite_differences(name):
             moved = replace(moved, channels=replace(start.channels, distances=measured))
         result = jaxcal.calibrate(moved, **others, **given)
         total = jnp.sum(weight * result.image_to_probe) + jnp.sum(result.point)
-        total += jnp.sum(result.elevation[::2]) + result.cost
+        total += jnp.sum(result.elevation[::2]) + result.convergence.cost
         return total, (result.differentiable, result.status_code)
 
     @jax.jit

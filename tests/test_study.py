@@ -696,7 +696,7 @@ def blocks(text):
                 "point_error": np.linalg.norm(found.point - drawn.point, axis=1),
                 "sigma": found.sigma,
                 "status": found.status_code,
-                "iterations": found.iterations,
+                "iterations": found.convergence.iterations,
             }
 
         yield spec, block, whole

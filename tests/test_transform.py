@@ -138,6 +138,7 @@ def test_npz_keeps_what_the_uncertainty_needs(tmp_path):
     known = replace(
         random_transform(), unknowns=unknowns, covariance=covariance[:6, :6],
         image_covariance=covariance, range_factor=0.99, probe_frame="Stylus",
+        doubtful_unit="may be in cm",
     )  # fmt: skip
     for name in ("cal.npz", "cal.json"):
         known.save(tmp_path / name)
@@ -149,14 +150,15 @@ def test_npz_keeps_what_the_uncertainty_needs(tmp_path):
         np.testing.assert_array_equal(applied.points, expected.points)
         np.testing.assert_array_equal(applied.covariance, expected.covariance)
         assert (found.unknowns, found.converged, found.error_mm) == (unknowns, True, 0.7)
-        assert found.probe_frame == "Stylus"
+        assert (found.probe_frame, found.doubtful_unit) == ("Stylus", "may be in cm")
+        assert "uncertain: may be in cm" in repr(found)
         assert found.date is not None
     old = ("image_plane_to_probe", "scale_mm_per_px", "covariance", "face_offset_mm")
     with np.load(tmp_path / "cal.npz") as file:
         np.savez(tmp_path / "old.npz", **{name: file[name] for name in old})
     found = load_calibration(tmp_path / "old.npz")
     np.testing.assert_array_equal(found.covariance, known.covariance)
-    assert (found.image_covariance, found.converged) == (None, None)
+    assert (found.image_covariance, found.converged, found.doubtful_unit) == (None, None, None)
 
 
 @pytest.mark.parametrize("name", ["a.tfm", "a.npz", "a.npy", "a.xml", "a.yaml", "a.csv", "a.h5"])

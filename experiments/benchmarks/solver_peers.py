@@ -103,7 +103,7 @@ def calibrated(batch: Batch) -> Solved:
     """``calibrate_batch`` with given SDs."""
     problems = jax.block_until_ready(problems_of(batch))
     found, seconds = read(problems, sigma=SIGMA_MM)
-    parts = (found.image_to_probe, found.point, found.iterations)
+    parts = (found.image_to_probe, found.point, found.convergence.iterations)
     matrix, point, iterations = (np.asarray(part, float) for part in parts)
     return Solved(matrix, point, iterations, seconds)
 

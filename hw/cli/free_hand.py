@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from typing import Any
+from typing import Any, get_args
 
 import click
 
@@ -12,6 +12,7 @@ from hw.runtime.choices import HAND_PLACEMENTS
 from jaxcal import InputError
 from jaxcal.cli.common import Server, prepare_jax, verdict_code
 from jaxcal.cli.sequence_options import probe_frame_option, region_option, spacing_option
+from jaxcal.data.names import Target
 
 
 @click.command("free-hand", short_help="Acquire with a hand-held probe, and calibrate.")
@@ -30,7 +31,7 @@ from jaxcal.cli.sequence_options import probe_frame_option, region_option, spaci
 @click.option("--device", metavar="NAME", help="Device of the images, if several are sent.")
 @click.option(
     "--target",
-    type=click.Choice(["echo", "cross"]),
+    type=click.Choice(get_args(Target)),
     default="echo",
     show_default=True,
     help="What to look for: one bright spot, or a crossing of wires.",

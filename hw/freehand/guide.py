@@ -18,8 +18,8 @@ from scipy.spatial.transform import Rotation
 from hw.freehand.posed import PosedImage
 from hw.runtime.rigid import mean_pose, turn_deg
 from jaxcal import InputError
+from jaxcal.data.names import Target
 from jaxcal.data.segmentation.image import localise
-from jaxcal.data.segmentation.spot import Target
 from jaxcal.runtime.array_types import Float
 
 _COLUMN_NAMES, _ROW_NAMES = ("left", "middle", "right"), ("upper", "central", "lower")

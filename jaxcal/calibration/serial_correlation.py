@@ -127,7 +127,7 @@ def widened(result: Calibration) -> Calibration:
 
 def _wider_medium(
     result: Calibration, covariance: Float[np.ndarray, "p p"], wider: Float[np.ndarray, "p p"]
-) -> Medium | None:
+) -> Medium:
     """Sound speed and delay with the SDs of the wider covariance."""
     medium, changed = result.medium, {}
     for name, field in (("sound-speed", "sound_speed_sd_m_s"), ("delay", "delay_sd_s")):
@@ -136,7 +136,7 @@ def _wider_medium(
             sd = getattr(medium, field)
             by = np.sqrt(wider[at, at] / covariance[at, at])
             changed[field] = like(sd, np.asarray(sd * by))
-    return medium if medium is None else replace(medium, **changed)
+    return replace(medium, **changed)
 
 
 def slowness(poses: Float[np.ndarray, "n 4 4"]) -> float:

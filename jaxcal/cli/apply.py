@@ -67,7 +67,7 @@ def apply(
     from jaxcal.io.outputs import begins_with, check_output
     from jaxcal.io.table import csv_text
     from jaxcal.report.differences import what_differs
-    from jaxcal.result.saved import load_calibration, stated_doubt
+    from jaxcal.result.saved import load_calibration
 
     if (source is None) == (not pixel):
         raise click.UsageError("name SOURCE, or points by --pixel U V")
@@ -98,8 +98,8 @@ def apply(
             f"{calibration}: knows no pixel size, so --pixel takes points in mm: lateral, range",
             err=True,
         )
-    if (doubt := stated_doubt(calibration)) is not None:
-        click.echo(f"- {calibration}: {doubt}", err=True)
+    if transform.doubtful_unit is not None:
+        click.echo(f"- {calibration}: {transform.doubtful_unit}", err=True)
     if transform.tre_factor > 1:
         click.echo(
             f"- {calibration}: its verdict expects errors {transform.tre_factor:.1f} times as "

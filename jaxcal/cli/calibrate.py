@@ -28,6 +28,7 @@ from jaxcal.cli.common import (
     segmented,
     verdict_code,
 )
+from jaxcal.cli.export import NAMING, TEXTS, check_configuration, patched, written
 from jaxcal.report.thresholds import FAIR_MM, GOOD_MM, WIDEST
 from jaxcal.runtime.messages import runs_in_words
 from jaxcal.solvers.names import Data, Method, PriorName, SolverName
@@ -38,8 +39,6 @@ if TYPE_CHECKING:
     from jaxcal.report.convergence import Curve
     from jaxcal.result.calibration import Calibration
     from jaxcal.result.transform import SaveFormat
-
-EXPORTS: tuple[SaveFormat, ...] = ("plus", "slicer", "itk", "ros", "tusrec", "numpy")
 
 
 def _one_recording(
@@ -312,10 +311,9 @@ def _export_target(text: str, inputs: list[str], out: str | None) -> tuple[SaveF
     from jaxcal.result.saved import check_target
 
     name, colon, path = text.partition(":")
-    known: dict[str, SaveFormat] = {each: each for each in EXPORTS}
-    format = known.get(name)
+    format = next((each for each in TEXTS if each == name), None)
     if not colon or not path or format is None:
-        raise InputError(f"--export {text}: FORMAT:PATH is needed, of {', '.join(EXPORTS)}")
+        raise InputError(f"--export {text}: FORMAT:PATH is needed, of {', '.join(TEXTS)}")
     if format != "plus":
         check_target(path, format, inputs)
     elif not Path(path).is_file():
@@ -349,7 +347,6 @@ def _check_exports(
 
     And configurations of PLUS that cannot take the transform to the recording's probe.
     """
-    from jaxcal.cli.export import check_configuration
     from jaxcal.io.frame_names import probe_name
     from jaxcal.result.saved import needs_pixels
 
@@ -370,7 +367,6 @@ def _export(
     """Write the transform for other programs; nothing of a calibration that did not converge."""
     if not targets:
         return []
-    from jaxcal.cli.export import NAMING, patched, written
     from jaxcal.io.frame_names import probe_name
     from jaxcal.result.saved import renamed, transform_from_record
 

@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from jaxcal.cli.common import ExitCode, json_option, print_json, print_page, simple_table
+from jaxcal.cli.common import (
+    ExitCode,
+    Verbatim,
+    json_option,
+    print_json,
+    print_page,
+    simple_table,
+)
 from jaxcal.runtime.messages import counted
 
 if TYPE_CHECKING:
@@ -83,14 +90,17 @@ def compare(
         unit = "mm" if transforms[0].scale_mm_per_px is None else "px"
         print_page(_table_of_points(pairs[0][2], unit), _sentence(pairs[0][2]), *notes)
     else:
-        print_page(_table_of_pairs(pairs), _summary([pair[2] for pair in pairs], clear), *notes)
+        numbered = [Verbatim(f"{k}: {name}") for k, name in enumerate(calibrations, start=1)]
+        found = [pair[2] for pair in pairs]
+        table = _table_of_pairs(found, len(calibrations))
+        print_page(*numbered, table, _summary(found, clear), *notes)
     return ExitCode.UNCERTAIN if clear else ExitCode.CONVERGED
 
 
 def _notes(calibrations: tuple[str, ...], transforms: list[ImageTransform]) -> list[str]:
     """What the calibrations should have in common and do not, and what their files say of them."""
     from jaxcal.report.differences import what_differs
-    from jaxcal.result.saved import stated_doubt, stated_source
+    from jaxcal.result.saved import stated_source
     from jaxcal.runtime.messages import quoted
 
     whose = ["the first", "the second"] if len(calibrations) == 2 else list(calibrations)
@@ -109,8 +119,8 @@ def _notes(calibrations: tuple[str, ...], transforms: list[ImageTransform]) -> l
                 f"The verdict of {name} expects errors {made.tre_factor:.1f} times as large as its "
                 "covariance says. The expected distances do not include this."
             )
-        if (doubt := stated_doubt(name)) is not None:
-            notes.append(f"{name}: {doubt}.")
+        if made.doubtful_unit is not None:
+            notes.append(f"{name}: {made.doubtful_unit}.")
     sources = [name for each in calibrations if (name := stated_source(each))]
     notes += [
         f"Several calibrations state that they were made from {quoted(name)}. If that is one "
@@ -158,15 +168,15 @@ def _table_of_points(found: Comparison, unit: str) -> Table:
     return table
 
 
-def _table_of_pairs(pairs: list[tuple[str, str, Comparison]]) -> Table:
-    names = ("first", "second", "agree")
+def _table_of_pairs(pairs: list[Comparison], count: int) -> Table:
+    """Each pair of ``count`` calibrations in a row, by their numbers: paths are too long for it."""
     sizes = ("apart, RMS (mm)", "expected (mm)", "95 % below (mm)")
-    table = simple_table((*names[:2], *sizes, names[2]), names)
+    table = simple_table(("first", "second", *sizes, "agree"), ("agree",))
     words = {True: "yes", False: "no", None: "-"}
-    for first, second, found in pairs:
+    for places, found in zip(combinations(range(1, count + 1), 2), pairs, strict=True):
         numbers = (found.rms_mm, found.expected_rms_mm, found.limit_mm)
         agree = "the same" if _are_same(found) else words[found.agree]
-        table.add_row(first, second, *map(_millimetres, numbers), agree)
+        table.add_row(*map(str, places), *map(_millimetres, numbers), agree)
     return table
 
 

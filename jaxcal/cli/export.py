@@ -15,7 +15,7 @@ from jaxcal.cli.sequence_options import with_options
 if TYPE_CHECKING:
     from jaxcal.result.transform import ImageTransform, SaveFormat
 
-_TEXTS = {
+TEXTS: dict[SaveFormat, str] = {
     "plus": "PLUS's <Transform> to paste into CoordinateDefinitions.",
     "slicer": "An ITK transform that Slicer loads (OUT.tfm, .txt or .h5).",
     "itk": "The same, for other programs that use ITK.",
@@ -23,6 +23,7 @@ _TEXTS = {
     "tusrec": "calib_matrix.csv of the TUS-REC challenge.",
     "numpy": "PLUS's matrix (OUT.npy), or all that is known (OUT.npz).",
 }
+"""What is written for other programs, by the options' names."""
 
 NAMING = ("plus", "ros")
 """Formats that name the frames."""
@@ -40,7 +41,7 @@ _FORMATS = tuple(
     click.option(
         f"--{name}", "format", flag_value=name, help=text, callback=_one_format, multiple=True
     )
-    for name, text in _TEXTS.items()
+    for name, text in TEXTS.items()
 )
 
 
@@ -108,13 +109,13 @@ def export(
     image plane in metres.
     """
     from jaxcal.io.frame_names import probe_name
-    from jaxcal.result.saved import check_target, load_calibration, renamed, stated_doubt
+    from jaxcal.result.saved import check_target, load_calibration, renamed
 
     asked = sum(chosen is not None for chosen in (format, plus_config, plus_server))
     if asked == 0 and out is not None:
         format, asked = check_target(out, None, [calibration]), 1
     if asked != 1:
-        names = ", ".join(f"--{name}" for name in (*_TEXTS, "plus-config"))
+        names = ", ".join(f"--{name}" for name in (*TEXTS, "plus-config"))
         raise click.UsageError(f"name one format: {names} or --plus-server")
     if plus_server is not None and out is not None:
         raise click.UsageError("--plus-server writes no file: leave OUT out")
@@ -146,8 +147,8 @@ def export(
         click.echo(transform.text(format, frames=frames), nl=False)
     if named and probe_frame is None and (note := renamed(transform)) is not None:
         click.echo(f"- {note}", err=True)
-    if (doubt := stated_doubt(calibration)) is not None:
-        click.echo(f"- {doubt}", err=True)
+    if transform.doubtful_unit is not None:
+        click.echo(f"- {transform.doubtful_unit}", err=True)
     return ExitCode.CONVERGED
 
 

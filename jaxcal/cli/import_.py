@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, get_args
 
 import click
 
 from jaxcal import InputError, OutputError
 from jaxcal.cli.common import ExitCode, progress
 from jaxcal.cli.sequence_options import SEARCH, TABLES, TRACKING, by_hand, with_options
+from jaxcal.data.names import Assignment, PointUnit
 from jaxcal.io.atomic import check_writable
 from jaxcal.io.outputs import RECORDING, check_output, is_hdf5_recording, is_recording
 from jaxcal.runtime.messages import counted
@@ -19,7 +20,7 @@ from jaxcal.runtime.messages import counted
 @click.argument("out", type=click.Path(), metavar="OUT.h5")
 @click.option(
     "--units",
-    type=click.Choice(["px", "mm"]),
+    type=click.Choice(get_args(PointUnit)),
     help="Unit of u and v in a table: px (lateral and axial pixel, the default) or mm (lateral "
     "position and range).",
 )
@@ -27,7 +28,7 @@ from jaxcal.runtime.messages import counted
 @with_options(TRACKING)
 @click.option(
     "--points",
-    type=click.Choice(["labels", "order"]),
+    type=click.Choice(get_args(Assignment)),
     help="How points of Slicer belong to frames: by the number that ends each label, or one for "
     "each frame.",
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, replace
 from math import inf
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, get_args
 
 import click
 
@@ -24,6 +24,8 @@ from jaxcal.cli.common import (
     segmented,
     simple_table,
 )
+from jaxcal.data.names import ProbeKind
+from jaxcal.design.names import Criterion
 from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
 from jaxcal.study.laws import OFFSET_LAWS, LawName
 
@@ -73,7 +75,7 @@ _PICTURES = (
 )
 @click.option(
     "--criterion",
-    type=click.Choice(["tre", "rp", "d"]),
+    type=click.Choice(get_args(Criterion)),
     default="tre",
     show_default=True,
     help="What to minimise: target registration error, reconstruction precision, or the volume "
@@ -81,7 +83,7 @@ _PICTURES = (
 )
 @click.option(
     "--probe",
-    type=click.Choice(["linear", "curvilinear"]),
+    type=click.Choice(get_args(ProbeKind)),
     help="Transducer, if the recording names none: L14-5 or C5-2.  [default: linear; with REC "
     "where its target was]",
 )
@@ -141,8 +143,8 @@ def plan(
     recording: str | None,
     images: int | None,
     until_tre: float | None,
-    criterion: Literal["tre", "rp", "d"],
-    probe: str | None,
+    criterion: Criterion,
+    probe: ProbeKind | None,
     depth: tuple[float, float] | None,
     lateral: float | None,
     cone: float | None,
@@ -239,7 +241,7 @@ def _columns(
 
 
 def _from_nothing(
-    probe: str,
+    probe: ProbeKind,
     depth: tuple[float, float] | None,
     lateral: float | None,
     cone: float | None,
@@ -281,7 +283,7 @@ def refuse_wrong_lengths(result: Calibration, path: str) -> None:
 def _from_recording(
     path: str,
     estimate: str | None,
-    probe: str | None,
+    probe: ProbeKind | None,
     depth: tuple[float, float] | None,
     lateral: float | None,
     cone: float | None,

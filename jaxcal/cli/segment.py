@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import click
 
@@ -28,6 +28,7 @@ from jaxcal.cli.sequence_options import (
     by_hand,
     with_options,
 )
+from jaxcal.data.names import NoiseScale, SegmentationMethod
 from jaxcal.runtime.messages import counted
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ if TYPE_CHECKING:
 @click.argument("recording", type=click.Path(), metavar="REC")
 @click.option(
     "--method",
-    type=click.Choice(["least-squares", "shortest"]),
+    type=click.Choice(get_args(SegmentationMethod)),
     default="least-squares",
     show_default=True,
     help="least-squares: fit the times of all elements; shortest: use the shortest time.",
@@ -54,7 +55,7 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--scale",
-    type=click.Choice(["frame", "pooled"]),
+    type=click.Choice(get_args(NoiseScale)),
     default="frame",
     show_default=True,
     help="Estimate the noise for each frame, or one for all frames (least-squares).",

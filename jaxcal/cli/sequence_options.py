@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import click
 
 from jaxcal.cli.common import POSITIVE, ImageNumbers, Verbatim
-from jaxcal.data.names import LengthUnit, Orientation, QuaternionOrder
+from jaxcal.data.names import LengthUnit, Orientation, QuaternionOrder, Target
 from jaxcal.runtime.messages import command_line
 
 if TYPE_CHECKING:
@@ -129,7 +129,7 @@ SEARCH = (
     click.option(
         "--target",
         "target_kind",
-        type=click.Choice(["echo", "cross"]),
+        type=click.Choice(get_args(Target)),
         help="What to look for in frames: one bright spot (the default), or a crossing of wires.",
     ),
     region_option,

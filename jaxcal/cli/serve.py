@@ -41,12 +41,12 @@ def serve(calibration: str, host: str, port: int, rate: float, name: str | None)
     """
     from jaxcal.io.frame_names import probe_name
     from jaxcal.io.serving import TransformServer
-    from jaxcal.result.saved import load_calibration, stated_doubt
+    from jaxcal.result.saved import load_calibration
 
     transform = load_calibration(calibration)
     transform.check_usable()
-    if (doubt := stated_doubt(calibration)) is not None:
-        click.echo(f"- {calibration}: {doubt}", err=True)
+    if transform.doubtful_unit is not None:
+        click.echo(f"- {calibration}: {transform.doubtful_unit}", err=True)
     name = f"ImageTo{probe_name(transform.probe_frame)}" if name is None else name
     with TransformServer(name, transform.plus_matrix(), host, port) as server:
         click.echo(f"{name} at {host}:{server.port}, {rate:g} times a second; Ctrl-C ends")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import get_args
 
 import click
 
@@ -16,6 +16,8 @@ from jaxcal.cli.common import (
     progress,
     seed_option,
 )
+from jaxcal.data.names import ProbeKind
+from jaxcal.study.laws import OFFSET_LAWS, LawName
 
 
 @click.command(short_help="Simulate an experiment and write its recording.")
@@ -27,11 +29,11 @@ from jaxcal.cli.common import (
     default=1.0,
     show_default=True,
     metavar="MM",
-    help="Elevational offsets: their bound (uniform) or SD (normal).",
+    help="Elevational offsets: their bound or SD, whichever their distribution has.",
 )
 @click.option(
     "--elevation-distribution",
-    type=click.Choice(["uniform", "normal"]),
+    type=click.Choice(OFFSET_LAWS),
     default="uniform",
     show_default=True,
     help="How the elevational offsets are distributed.",
@@ -46,7 +48,7 @@ from jaxcal.cli.common import (
 )
 @click.option(
     "--probe",
-    type=click.Choice(["linear", "curvilinear"]),
+    type=click.Choice(get_args(ProbeKind)),
     default="linear",
     show_default=True,
     help="Transducer: L14-5 or C5-2. The data of a curvilinear one are its times of flight.",
@@ -63,9 +65,9 @@ def simulate(
     out: str,
     images: int,
     elevation: float,
-    elevation_distribution: Literal["uniform", "normal"],
+    elevation_distribution: LawName,
     noise: float,
-    probe: str,
+    probe: ProbeKind,
     raw: bool,
     clock_mhz: float | None,
     seed: int,

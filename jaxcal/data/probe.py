@@ -15,6 +15,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from jaxcal import InputError
+from jaxcal.data.names import ProbeKind
 from jaxcal.data.sound import check_sound_speed
 from jaxcal.runtime.array_types import Bool, Float, Num
 from jaxcal.runtime.given_values import is_number, real_array
@@ -237,4 +238,4 @@ L14_5 = LinearProbe()
 C5_2 = CurvilinearProbe()
 """An abdominal convex array of the C5-2 kind: 128 elements over 60 degrees at 60 mm."""
 
-PRESETS: dict[str, Probe] = {"linear": L14_5, "curvilinear": C5_2}
+PRESETS: dict[ProbeKind, Probe] = {"linear": L14_5, "curvilinear": C5_2}

@@ -7,6 +7,7 @@ the squared target registration error and the squared reconstruction precision a
 constraints.py  where a pose may be: image region, cone, turn, box, reach
 noise.py        SDs as functions of where the target is in the image
 information.py  G of a pose; the information of a calibration
+names.py        the criteria by name
 criteria.py     W of TRE and RP; the gain of a pose in closed form; predicted errors
 candidates.py   poses to choose from: for a probe and a region, or around a recording
 greedy.py       chooses one pose after the other, then exchanges each for the best candidate

@@ -20,9 +20,10 @@ import numpy as np
 
 from jaxcal import InputError
 from jaxcal.design.candidates import Candidates
-from jaxcal.design.criteria import Criterion, check_criterion, tuned_factor, weight_of
+from jaxcal.design.criteria import check_criterion, tuned_factor, weight_of
 from jaxcal.design.greedy import MOST_POSES
 from jaxcal.design.information import Known, covariance_of
+from jaxcal.design.names import Criterion
 from jaxcal.design.planning import Plan, check_candidates, known_before, with_effective_noise
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.given_values import whole_number

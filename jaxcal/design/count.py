@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxcal import InputError
 from jaxcal.design.candidates import Candidates
-from jaxcal.design.criteria import Criterion
+from jaxcal.design.names import Criterion
 from jaxcal.design.planning import Plan, next_poses, plan
 from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
 from jaxcal.result.calibration import Calibration

@@ -25,19 +25,19 @@ sets of SDs (:func:`hypotheses`); only the ratios of the SDs matter.
 
 from __future__ import annotations
 
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 
 from jaxcal import InputError
 from jaxcal.design.candidates import Candidates
 from jaxcal.design.information import Known, Model, covariance_of
+from jaxcal.design.names import Criterion
 from jaxcal.diagnostics.intervals import student_variance
 from jaxcal.model.image_points import mean_of_squares, point_jacobian
 from jaxcal.runtime.array_types import AnyArray, Array, Float, Int
 from jaxcal.runtime.given_values import check_made, real_array
 
-Criterion = Literal["tre", "rp", "d"]
 _PIECE = 800
 """Poses whose products are computed at once."""
 

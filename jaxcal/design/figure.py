@@ -9,12 +9,11 @@ import numpy as np
 
 from jaxcal import InputError
 from jaxcal.design.planning import Plan
+from jaxcal.runtime.colours import BLUE, GREY, ORANGE
 from jaxcal.runtime.given_values import check_made, is_number
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-_BLUE, _ORANGE, _GREY = "#0072B2", "#D55E00", "#666666"
 
 
 def plan_figure(plan: Plan, wanted_mm: float | None = None) -> Figure:
@@ -38,7 +37,7 @@ def plan_figure(plan: Plan, wanted_mm: float | None = None) -> Figure:
 
 def _kinds(plan: Plan) -> tuple[tuple[np.ndarray, str, str, str], ...]:
     """The poses that were chosen and those that fill space, with colour, shape and name."""
-    return (~plan.filling, _BLUE, "o", "chosen"), (plan.filling, _ORANGE, "^", "fills space")
+    return (~plan.filling, BLUE, "o", "chosen"), (plan.filling, ORANGE, "^", "fills space")
 
 
 def _places(plan: Plan, panel: Any) -> None:
@@ -47,7 +46,7 @@ def _places(plan: Plan, panel: Any) -> None:
     steps = np.linspace(0, 1, 20)[:, None]
     outline = np.concatenate([a + steps * (b - a) for a, b in pairwise(edge)])
     outline = plan.candidates.constraints.region.place(outline)
-    panel.plot(outline[:, 0], outline[:, 2], color=_GREY, linewidth=0.8)
+    panel.plot(outline[:, 0], outline[:, 2], color=GREY, linewidth=0.8)
     for which, colour, shape, label in _kinds(plan):
         places = plan.targets[which]
         panel.plot(places[:, 0], places[:, 2], shape, color=colour, markersize=4, label=label)
@@ -87,13 +86,13 @@ def _errors(plan: Plan, wanted_mm: float | None, panel: Any) -> None:
     # Errors of the first few images are so large that they would hide the others.
     seen = count >= min(6, count[-1])
     for values, colour, style, label in (
-        (plan.tre_mm, _BLUE, "o-", "target registration error"),
-        (plan.rp_mm, _ORANGE, "^-", "reconstruction precision"),
+        (plan.tre_mm, BLUE, "o-", "target registration error"),
+        (plan.rp_mm, ORANGE, "^-", "reconstruction precision"),
     ):
         panel.plot(count[seen], values[seen], style, color=colour, markersize=3, label=label)
     panel.set_xlim(count[seen][0] - 0.5, count[-1] + 0.5)
     if wanted_mm is not None:
-        panel.axhline(wanted_mm, color=_GREY, linewidth=0.8, linestyle="--", label="wanted")
+        panel.axhline(wanted_mm, color=GREY, linewidth=0.8, linestyle="--", label="wanted")
     panel.set(
         xlabel="images", ylabel="predicted error (mm)", yscale="log", title="how many images?"
     )

@@ -10,7 +10,6 @@ from jaxcal import InputError
 from jaxcal.data.recording import MINIMUM_IMAGES
 from jaxcal.design.candidates import Candidates
 from jaxcal.design.criteria import (
-    Criterion,
     check_criterion,
     curve,
     hypotheses,
@@ -33,6 +32,7 @@ from jaxcal.design.information import (
     effective_elevational,
     known_information,
 )
+from jaxcal.design.names import Criterion
 from jaxcal.design.noise import SD_RANGE_MM, Noise, check_result
 from jaxcal.diagnostics.directions import direction_in_words
 from jaxcal.diagnostics.uncertainty import mm_at_target, nearest_unknown

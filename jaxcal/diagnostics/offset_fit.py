@@ -85,7 +85,7 @@ def offset_law(result: Calibration) -> dict[str, object] | None:
     if weighed:
         wrong = _contradicted(result)
         considered = ("uniform",) if result.prior == "uniform" else FAMILIES
-        if np.asarray(result.sigma_floored)[2]:
+        if np.asarray(result.convergence.sigma_floored)[2]:
             words = "The offsets are too small to tell their distribution"
         else:
             words = _law_in_words({name: probability[name] for name in considered}, wrong)

@@ -88,7 +88,7 @@ def _without_convergence(result: Calibration) -> list[str]:
     if result.status == "max_iterations":
         return [
             "not converged: the iteration limit was reached "
-            f"(scaled KKT residual {float(result.stationarity):.1e})"
+            f"(scaled KKT residual {float(result.convergence.stationarity):.1e})"
         ]
     return []
 
@@ -147,17 +147,17 @@ def _only_the_bound(result: Calibration) -> list[str]:
 
 
 def _odd_start_or_end(result: Calibration) -> list[str]:
-    """A start that had to be searched for, and an alternation that ended before its minimum."""
-    found = []
-    if result.searched_start:
+    """A start that is not certain, and an alternation that ended before its minimum."""
+    found, ended = [], result.convergence
+    if ended.searched_start:
         found.append(
-            "the closed-form start was unusable (degenerate poses or points, or too few images for "
-            "their noise); a start was found by trying 24 rotations"
+            "the start is not certain (degenerate poses or points, or too few images for their "
+            "noise): it was found by descents from many rotations"
         )
-    if result.method == "alternating" and result.tolerance_met and result.stationarity > STEADY:
+    if result.method == "alternating" and ended.tolerance_met and ended.stationarity > STEADY:
         found.append(
             "the alternation stopped on its tolerance while its objective was still falling "
-            f"(scaled KKT residual {float(result.stationarity):.1e})"
+            f"(scaled KKT residual {float(ended.stationarity):.1e})"
         )
     return found
 
@@ -180,8 +180,8 @@ def _sds_not_tuned(result: Calibration) -> list[str]:
                 "used"
             )
         found.append(text)
-    if np.any(result.sigma_floored):
-        errors = zip(KINDS, result.sigma_floored, strict=True)
+    if np.any(result.convergence.sigma_floored):
+        errors = zip(KINDS, result.convergence.sigma_floored, strict=True)
         names = [name for name, floored in errors if floored]
         rest = "error is" if len(names) == 1 else "errors are"
         owner = "its SD is" if len(names) == 1 else "their SDs are"
@@ -321,8 +321,9 @@ def _medium_warnings(result: Calibration) -> list[str]:
     found, problem = [], result.problem
     assumed_speed = None if problem is None else float(problem.nominal_sound_speed)
     assumed_delay = 0.0 if problem is None or problem.delay is None else float(problem.delay)
-    speed = (result.sound_speed_m_s, result.sound_speed_sd_m_s, result.sound_speed_prior_m_s)
-    delay = (result.delay_s, result.delay_sd_s, result.delay_prior_s)
+    of = result.medium
+    speed = of.sound_speed_m_s, of.sound_speed_sd_m_s, of.sound_speed_prior_m_s
+    delay = of.delay_s, of.delay_sd_s, of.delay_prior_s
     for name, (value, sd, believed), nominal, unit in (
         ("sound speed", speed, assumed_speed, "m/s"),
         ("delay", delay, assumed_delay, "us"),

@@ -19,6 +19,7 @@ TIMES_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
 _NAMES = {
     "time": ("time", "t", "timestamp", "timestamps", "stamp", "seconds"),
+    "nanoseconds": ("nanosec",),
     "frame": ("frame", "framenumber", "frameindex", "index", "image", "imagenumber"),
     "file": ("file", "filename", "imagefile", "png"),
     "ignored": ("name", "label", "comment"),
@@ -41,8 +42,14 @@ _UNIT = re.compile(
 )
 _OF_MESSAGE = re.compile(r".*[./]((?:position|translation|orientation|rotation)[./][xyzw])")
 """A part of a ROS message by its path, as ``pose.position.x``, without what stands before it."""
-_OF_HEADER = re.compile(r"field\.(?:.*\.)?(?:header\.(?P<part>seq|stamp|frame_id)|child_frame_id)")
-"""A part of a ROS message's header, or the name of its frame, as ``rostopic echo -p`` writes it."""
+_OF_HEADER = re.compile(
+    r"(?P<field>field\.)?(?:.*\.)?"
+    r"(?:header\.(?P<part>seq|stamp|stamp\.secs|stamp\.nsecs|frame_id)|(?P<child>child_frame_id))"
+)
+"""A part of a ROS message's header, or the name of its frame. ``rostopic echo -p`` writes ``field.``
+before it and the stamp in ns, bagpy the stamp as two numbers."""
+_STAMPS = {"stamp": ("time", "ns"), "stamp.secs": ("time", "s"), "stamp.nsecs": ("nanosec", "ns")}
+"""Name and unit of a header's parts that are read."""
 _CELL = re.compile(r"([a-z]*?)_?([0-4])[_,]?([0-4])")
 _NUMBERED = re.compile(r"([a-z]*?)_?(\d{1,2})")
 _OTHER_ROTATION = re.compile(
@@ -78,6 +85,7 @@ class Columns:
         quaternion: 4 columns, x y z w; None without.
         point: 2 columns, u v or lateral range; None without.
         time: s.
+        nanoseconds: what is to be added to the time, ns.
         frame: number of an image.
         file: name of an image's file.
         valid: whether a row counts.
@@ -92,6 +100,7 @@ class Columns:
     quaternion: tuple[int, ...] | None = None
     point: tuple[int, ...] | None = None
     time: int | None = None
+    nanoseconds: int | None = None
     frame: int | None = None
     file: int | None = None
     valid: int | None = None
@@ -169,6 +178,8 @@ def columns_of_header(names: list[str], quaternion: QuaternionOrder | None) -> C
         raise FormatError("the header names both a matrix and a quaternion")
     point, point_unit = _point(roles, list(units))
     lengths = translation or (matrix[3:12:4] if matrix else ())
+    if "nanoseconds" in roles and "time" not in roles:
+        raise FormatError("the header has nanoseconds of a time, but not its seconds")
     time_unit = None if "time" not in roles else units[roles["time"]]
     if time_unit not in (None, *TIMES_S):
         raise FormatError(f"time in {quoted(str(time_unit))} is not known: s, ms, us or ns")
@@ -178,6 +189,7 @@ def columns_of_header(names: list[str], quaternion: QuaternionOrder | None) -> C
         quaternion=quaternion_columns,
         point=point,
         time=roles.get("time"),
+        nanoseconds=roles.get("nanoseconds"),
         frame=roles.get("frame"),
         file=roles.get("file"),
         valid=roles.get("valid"),
@@ -189,19 +201,27 @@ def columns_of_header(names: list[str], quaternion: QuaternionOrder | None) -> C
 
 
 def _not_read(names: list[str]) -> list[int]:
-    """Columns of ``rostopic echo -p`` that are neither a pose nor the time of its measurement.
+    """Columns of a ROS message that are neither a pose nor the time of its measurement.
 
-    The first one, ``%time``, is the time of the recording where the message comes from a bag.
+    The first one, ``%time`` of ``rostopic echo -p`` and ``Time`` of bagpy, is the time of the
+    recording where the message comes from a bag.
     """
-    lower = [name.strip().lower() for name in names]
-    found = [_OF_HEADER.fullmatch(name) for name in lower]
-    parts = [None if match is None else match["part"] for match in found]
-    stamped = "stamp" in parts
+    parts = [_header_part(name) for name in names]
+    of_bag = {"%time"} if "stamp" in parts else {"time"} if "stamp.secs" in parts else set()
     return [
         index
-        for index, (name, match, part) in enumerate(zip(lower, found, parts, strict=True))
-        if (match is not None and part != "stamp") or (stamped and name == "%time")
+        for index, (name, part) in enumerate(zip(names, parts, strict=True))
+        if (part is not None and part not in _STAMPS) or name.strip().lower() in of_bag
     ]
+
+
+def _header_part(name: str) -> str | None:
+    """The part of a ROS message's header, if a column is one."""
+    found = _OF_HEADER.fullmatch(name.strip().lower())
+    # Without "field." nothing says in what unit a stamp is that is one number.
+    if found is None or (found["part"] == "stamp" and not found["field"]):
+        return None
+    return found["part"] or found["child"]
 
 
 def _unknown(names: list[str], column: int) -> FormatError:
@@ -220,10 +240,9 @@ def _split(name: str) -> tuple[str, str | None]:
 
 
 def _base_and_unit(name: str) -> tuple[str, str | None]:
+    if (stamp := _STAMPS.get(_header_part(name) or "")) is not None:
+        return stamp
     base, unit = _split(name)
-    of_header = _OF_HEADER.fullmatch(name.strip().lower())
-    if of_header is not None and of_header["part"] == "stamp":
-        return "time", "ns"
     if base == "seconds" and unit is None:
         unit = "s"
     if base == "%time" and unit is None:

@@ -28,12 +28,13 @@ from __future__ import annotations
 
 import io
 import os
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 import h5py
 import numpy as np
 
 from jaxcal import FormatError, InputError
+from jaxcal.data.names import ProbeKind
 from jaxcal.data.poses import check_poses
 from jaxcal.data.probe import CurvilinearProbe, LinearProbe, Probe
 from jaxcal.data.recording import (
@@ -215,7 +216,7 @@ def _read_probe(root: Node) -> Probe | None:
     if node is None:
         return None
     kind = text(node, "kind")
-    if kind not in ("linear", "curvilinear"):
+    if kind not in get_args(ProbeKind):
         what = "missing" if kind is None else quoted(kind)
         raise FormatError(f"/probe: attribute kind is {what}, 'linear' or 'curvilinear' is needed")
     elements = _needed(node, "elements")

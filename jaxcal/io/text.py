@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 
 from jaxcal import FormatError, InputError
-from jaxcal.data.names import LengthUnit, QuaternionOrder
+from jaxcal.data.names import LengthUnit, PointUnit, QuaternionOrder
 from jaxcal.data.poses import (
     check_poses,
     inverse_poses,
@@ -133,7 +133,7 @@ def read_pose_table(
     *,
     quaternion: QuaternionOrder | None = None,
     pose_units: LengthUnit | None = None,
-    units: Literal["px", "mm"] | None = None,
+    units: PointUnit | None = None,
     skip_invalid: bool = False,
     invert_poses: bool = False,
     ignore_time: bool = False,
@@ -161,7 +161,7 @@ def read_pose_table(
         columns = _columns(table, quaternion)
         if quaternion is not None and columns.matrix is not None:
             raise FormatError("its poses are matrices: leave --quaternion out")
-        needed = replace(columns, time=None) if ignore_time else columns
+        needed = replace(columns, time=None, nanoseconds=None) if ignore_time else columns
         rows, skipped = _used_rows(table, needed, skip_invalid)
         unit = _agreed(units, columns.point_unit)
         points = None if columns.point is None else table.numbers(columns.point, rows)
@@ -227,16 +227,14 @@ def recording_of(
     return Recording(images, source=table.name)
 
 
-def read_crosswire(
+def read_pair(
     transforms_path: str | os.PathLike[str],
     points_path: str | os.PathLike[str],
     *,
-    spacing_mm: np.ndarray | tuple[float, float] | None = None,
     pose_units: LengthUnit = "mm",
     invert_poses: bool = False,
-    minimum: int = MINIMUM_IMAGES,
-) -> Recording:
-    """Read a cross-wire recording: a text file of poses and one of pixels.
+) -> PoseTable:
+    """Read a text file of poses without a header and one of pixels, as of cross-wire recordings.
 
     Args:
         transforms_path: 3 rows ``R_i0 R_i1 R_i2 t_i`` for each image, i = 0, 1, 2: probe ->
@@ -244,20 +242,17 @@ def read_crosswire(
             image, the matrix row by row.
         points_path: a row ``u v`` for each image: lateral and axial, px. A header may name the two
             columns, and no others.
-        spacing_mm: [lateral, axial] mm per px, when known.
         pose_units: of translations in the file.
         invert_poses: those of the file are tracker -> probe; their inverses are taken.
-        minimum: least number of images.
 
     Returns:
-        Images of kind ``pixel``; rotations are projected to SO(3).
+        Poses as they stand, with their points in pixels.
 
     Raises:
         FormatError: a file that cannot be read, a row of another length, something that is not a
             number, rows that do not make whole poses, a header of the points that names more than
             u and v, or files of different lengths; the file and the line are named.
-        InputError: poses or pixels that cannot be used (see
-        :func:`jaxcal.data.recording.make_images`).
+        InputError: poses that are to be inverted and are no rigid transforms.
     """
     transforms = _plain_table(transforms_path)
     columns = "3 rotation numbers and a translation, or a matrix row by row; points come second"
@@ -273,8 +268,23 @@ def read_crosswire(
     if invert_poses:
         with naming(transforms_path):
             poses = inverse_poses(check_poses(poses))
-    images = make_images(poses, pixels, "pixel", spacing_mm=spacing_mm, minimum=minimum, where=name)
-    return Recording(images, source=name)
+    rows = list(range(len(pixels)))
+    return PoseTable(name=name, lines=rows, rows=rows, poses=poses, points=pixels)
+
+
+def read_crosswire(
+    transforms_path: str | os.PathLike[str],
+    points_path: str | os.PathLike[str],
+    *,
+    spacing_mm: np.ndarray | tuple[float, float] | None = None,
+    pose_units: LengthUnit = "mm",
+) -> Recording:
+    """The recording of :func:`read_pair`; ``spacing_mm`` is [lateral, axial] mm per px, if known.
+
+    Raises:
+        InputError: what :func:`read_pair` or :func:`recording_of` refuses.
+    """
+    return recording_of(read_pair(transforms_path, points_path, pose_units=pose_units), spacing_mm)
 
 
 def read_poses(
@@ -288,7 +298,7 @@ def read_poses(
 
     Args:
         path: a row for each pose, of 7 numbers, ``x y z`` and a unit quaternion, or of 12 or 16,
-            the matrix row by row; or 3 or 4 rows of 4 numbers, as in :func:`read_crosswire`.
+            the matrix row by row; or 3 or 4 rows of 4 numbers, as in :func:`read_pair`.
         quaternion: where the scalar stands; needed for rows of 7 numbers, and refused for others.
         pose_units: of translations in the file.
         invert_poses: return the inverses of the file's poses.
@@ -308,10 +318,8 @@ def read_poses(
     if rows.shape[1] != 7:
         if quaternion is not None:
             raise FormatError(f"{table.name}: its poses are matrices: leave --quaternion out")
-        matrices, lines = _stacked(table, rows)
-        matrices[:, :3, 3] *= LENGTHS_MM[pose_units]
-        poses = np.tile(np.eye(4), (len(matrices), 1, 1))
-        poses[:, : matrices.shape[1]] = matrices
+        poses, lines = _stacked(table, rows)
+        poses[:, :3, 3] *= LENGTHS_MM[pose_units]
     else:
         if quaternion is None:
             raise _order_unknown(table)
@@ -371,14 +379,14 @@ def _plain_table(path: str | os.PathLike[str]) -> Table:
 
 def _stacked(
     table: Table, rows: Float[np.ndarray, "rows columns"]
-) -> tuple[Float[np.ndarray, "n k 4"], list[int]]:
-    """Matrices of 3 or 4 rows from rows of 12, 16 or 4 numbers, and the line of each.
+) -> tuple[Float[np.ndarray, "n 4 4"], list[int]]:
+    """Matrices from rows of 12, 16 or 4 numbers, and the line of each.
 
     Raises:
         FormatError: rows of 4 numbers that are not whole poses.
     """
     if rows.shape[1] != 4:
-        return rows.reshape(len(rows), -1, 4), table.lines
+        return _with_last_row(rows.reshape(len(rows), -1, 4)), table.lines
     matrices = rows.reshape(-1, 4, 4) if len(rows) % 4 == 0 else np.empty((0, 4, 4))
     edge = [0, 0, 0, 1]
     # Whole matrices: no row of a rotation is zero.
@@ -393,7 +401,13 @@ def _stacked(
         raise FormatError(
             f"{table.row(-1)}: {len(rows)} rows are not whole poses: each takes 3 rows"
         )
-    return rows.reshape(-1, 3, 4), table.lines[::3]
+    return _with_last_row(rows.reshape(-1, 3, 4)), table.lines[::3]
+
+
+def _with_last_row(matrices: Float[np.ndarray, "n k 4"]) -> Float[np.ndarray, "n 4 4"]:
+    whole = np.tile(np.eye(4), (len(matrices), 1, 1))
+    whole[:, : matrices.shape[1]] = matrices
+    return whole
 
 
 def _labels(lines: list[int]) -> list[str]:
@@ -454,7 +468,7 @@ def _used_rows(
         *(columns.translation or ()),
         *(columns.quaternion or ()),
         *(columns.point or ()),
-        *(() if columns.time is None else (columns.time,)),
+        *(each for each in (columns.time, columns.nanoseconds) if each is not None),
     ]
     pose, comma = columns.quaternion or columns.matrix or (), table.separator != ","
     kept: list[int] = []
@@ -516,7 +530,7 @@ def _poses(
     return poses
 
 
-def _agreed(asked: str | None, stated: str | None) -> str:
+def _agreed(asked: PointUnit | None, stated: str | None) -> str:
     if asked is not None and stated not in (None, asked):
         raise FormatError(f"the header says that points are in {stated}, not {asked}")
     return stated or asked or "px"
@@ -549,6 +563,8 @@ def _times(
                 f"ISO 8601 (2026-11-26T08:15:00): {quoted(table.rows[rows[0]][column])}"
             )
         time = table.numbers((column,), rows)[:, 0] * (columns.time_s or 1.0)
+        if columns.nanoseconds is not None:
+            time += 1e-9 * table.numbers((columns.nanoseconds,), rows)[:, 0]
         late = np.flatnonzero(np.abs(time) > _LATEST_S)
         if len(late):
             raise FormatError(

@@ -259,7 +259,7 @@ def _comparison(
     gain = spread = None
     # Within a bound, offsets fit themselves: their errors are zero, and have no density. SDs at
     # their lower limit are not those of the errors.
-    if answer.prior != "bounded" and not np.any(answer.sigma_floored):
+    if answer.prior != "bounded" and not np.any(answer.convergence.sigma_floored):
         gain = float(density.sum())
         spread = float(np.std(density[used], ddof=1) * math.sqrt(used.sum()))
     return {

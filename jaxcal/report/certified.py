@@ -43,9 +43,9 @@ def certificate_record(result: Calibration) -> dict[str, Any]:
 
 
 def _of_answer(result: Calibration, problem: Problem, estimate: tuple[str, ...]) -> Certificate:
-    factor, scale = 1.0, result.scale_mm_per_px
-    if result.sound_speed_m_s is not None:
-        factor = float(result.sound_speed_m_s / problem.nominal_sound_speed)
+    factor, scale, speed = 1.0, result.scale_mm_per_px, result.medium.sound_speed_m_s
+    if speed is not None:
+        factor = float(speed / problem.nominal_sound_speed)
     return certify(
         problem,
         np.asarray(result.image_to_probe, dtype=float),

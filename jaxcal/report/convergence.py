@@ -76,7 +76,7 @@ def bounded_curves(
     # The joint solver's first value is that of its best start after the warm-up rounds, whose
     # values are not kept.
     steps = np.concatenate([np.full(WARM_UP_ROUNDS, np.nan), _trace(joint)])
-    stopped = None if alternating is None else int(alternating.iterations)
+    stopped = None if alternating is None else int(alternating.convergence.iterations)
     return [
         Curve(
             f"joint (best of three starts, after {WARM_UP_ROUNDS} alternating rounds each)", steps
@@ -86,4 +86,5 @@ def bounded_curves(
 
 
 def _trace(result: Calibration) -> Float[np.ndarray, " k"]:
-    return np.empty(0) if result.trace is None else np.asarray(result.trace, dtype=float)
+    trace = result.convergence.trace
+    return np.empty(0) if trace is None else np.asarray(trace, dtype=float)

@@ -51,6 +51,7 @@ from jaxcal.result.calibration import Calibration
 from jaxcal.result.saved import transform_from_record
 from jaxcal.result.transform import SaveFormat
 from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.colours import BLUE, GREEN, ORANGE
 from jaxcal.runtime.messages import counted
 from jaxcal.solvers.plan import TUNED
 
@@ -62,9 +63,9 @@ LONGEST_LIST = 3000
 _DOCTYPE, _TITLE = "<!DOCTYPE html>", "<title>Calibration of "
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:"
 _KINDS = (
-    ("lateral", "lateral", svg.BLUE),
-    ("range", "axial", svg.GREEN),
-    ("elevational", "out of the plane", svg.ORANGE),
+    ("lateral", "lateral", BLUE),
+    ("range", "axial", GREEN),
+    ("elevational", "out of the plane", ORANGE),
 )
 _FORMS: tuple[tuple[SaveFormat, str, str], ...] = (
     ("plus", "PLUS", "ImageToProbe, to paste into CoordinateDefinitions of a device set."),
@@ -326,14 +327,14 @@ def _scene(record: dict[str, Any], answer: Calibration, recording: Recording) ->
     far = np.concatenate([frames.reshape(-1, 3), point[None]])
     centre = 0.5 * (far.min(axis=0) + far.max(axis=0))
     lines = [
-        {"points": _rounded(outline), "colour": svg.BLUE, "width": 0.5, "fill": svg.BLUE}
+        {"points": _rounded(outline), "colour": BLUE, "width": 0.5, "fill": BLUE}
         for outline in frames[:: max(-(-len(frames) // MOST_PLANES), 1)]
     ]
     dots = [
-        {"at": _rounded(frame[:3, 3]), "r": 1.6, "colour": svg.BLUE, "title": f"image {image}"}
+        {"at": _rounded(frame[:3, 3]), "r": 1.6, "colour": BLUE, "title": f"image {image}"}
         for frame, image in zip(images, shown.tolist(), strict=True)
     ]
-    dots.append({"at": _rounded(point), "r": 4, "colour": svg.ORANGE, "title": "target"})
+    dots.append({"at": _rounded(point), "r": 4, "colour": ORANGE, "title": "target"})
     whole = {
         "centre": _rounded(centre),
         "radius": float(np.linalg.norm(far - centre, axis=1).max()),
@@ -399,7 +400,7 @@ def _close_up(
             "at": _rounded(place),
             "r": 2.2,
             "title": f"image {image}, {apart:.3g} mm",
-            "colour": svg.ORANGE if image in named else svg.GREEN,
+            "colour": ORANGE if image in named else GREEN,
         }
         for place, image, apart in zip(cloud, shown.tolist(), away, strict=True)
         if apart <= 1.2 * radius
@@ -440,9 +441,9 @@ def _residuals(record: dict[str, Any], answer: Calibration) -> str:
         [
             (f"{name} (mm)", used, residual[:, axis], colour)
             for name, axis, colour in (
-                ("lateral", 0, svg.BLUE),
-                ("axial", 2, svg.GREEN),
-                ("elevational", 1, svg.ORANGE),
+                ("lateral", 0, BLUE),
+                ("axial", 2, GREEN),
+                ("elevational", 1, ORANGE),
             )
         ],
         named,
@@ -451,7 +452,7 @@ def _residuals(record: dict[str, Any], answer: Calibration) -> str:
     )
     offset = np.asarray(answer.elevation)[used]
     second = svg.series(
-        [("offset (mm)", used, offset, svg.ORANGE)],
+        [("offset (mm)", used, offset, ORANGE)],
         named,
         "Estimated offset of the target from the image plane, mm",
         spread=np.asarray(answer.elevation_sd)[used],
@@ -472,7 +473,7 @@ def _residuals(record: dict[str, Any], answer: Calibration) -> str:
         moved = influence["moved_mm"]
         shown = [int(k) for k in used if moved[int(k)] is not None]
         third = svg.series(
-            [("change (mm)", shown, [moved[k] for k in shown], svg.BLUE)],
+            [("change (mm)", shown, [moved[k] for k in shown], BLUE)],
             influence["most"][:3],
             "How far leaving out an image would change the calibration, mm in the image",
             height=120.0,

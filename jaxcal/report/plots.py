@@ -25,13 +25,13 @@ from jaxcal.model.image_points import mean_of_squares
 from jaxcal.report.accuracy import error_shares, region_of, scatter_shares
 from jaxcal.report.convergence import Curve
 from jaxcal.report.in_memory import recording_of
-from jaxcal.report.svg import BLUE, GREEN, ORANGE, bar_length, drawn, ink, spread_out
+from jaxcal.report.svg import bar_length, drawn, ink, spread_out
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.colours import BLUE, GREEN, GREY, ORANGE
 from jaxcal.runtime.given_values import real_array
 
 COLUMN_MM, PAGE_MM = 88.0, 180.0
-GREY = "#666666"
 _MOST_BINS = 60
 """Most bars of a histogram."""
 _ROUNDING = 3e-14

@@ -20,7 +20,6 @@ def cross_validation_record(found: CrossValidation, result: Calibration) -> dict
     """Cross-validation as plain values; ``result`` is the calibration of all images."""
     influence = np.asarray(found.influence, dtype=float)
     used = np.asarray(found.mask) > 0
-    strongest = np.argsort(np.where(used & np.isfinite(influence), -influence, np.inf))[:5]
     return plain(
         {
             "folds": len(np.asarray(found.converged)),
@@ -32,7 +31,6 @@ def cross_validation_record(found: CrossValidation, result: Calibration) -> dict
             "image_moved_mm": np.where(used, np.asarray(found.image_moved), np.nan),
             "image_points_mm": np.asarray(found.image_points),
             "stated_mm": stated_at(result, np.asarray(found.image_points)),
-            "most_influential": [int(image) for image in strongest if used[image]],
         }
     )
 

@@ -1,8 +1,7 @@
 """Small vector figures as text: axes with units, stems, bars and maps, without other libraries.
 
 Coordinates are those of a figure 380 units wide, which a page can show at any width. Colours are
-CSS variables of the page, so a figure follows the page's light or dark scheme. Colours of data are
-those of Okabe and Ito, which the colour-blind can tell apart.
+CSS variables of the page, so a figure follows the page's light or dark scheme.
 """
 
 from __future__ import annotations
@@ -16,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from jaxcal.runtime.array_types import Float, Int
+from jaxcal.runtime.colours import BLUE, ORANGE
 
 Number = float | int | np.floating
 
@@ -24,7 +24,8 @@ MOST_DRAWN = 2000
 """Most images of one curve: more than three for each unit of a figure's width."""
 MOST_PLACES = 400
 """Most places of the target in a map."""
-BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#8a8a8a"
+_SPREAD = "#8a8a8a"
+"""Colour of intervals, to be seen on white and on black."""
 
 _VIRIDIS = (
     (68, 1, 84),
@@ -239,13 +240,13 @@ class Panel:
             dots.append(circle(across, down, 1.9, f'fill="{colour}"', title))
         return [f'<path d="{"".join(moves)}" stroke="{colour}" stroke-width="0.7"/>', *dots]
 
-    def bars(self, x: Iterable[Any], low: Iterable[Any], high: Iterable[Any], colour: str) -> str:
+    def bars(self, x: Iterable[Any], low: Iterable[Any], high: Iterable[Any]) -> str:
         """Vertical intervals, as one path."""
         moves = []
         for a, b, c in zip(x, low, high, strict=True):
             across, first = self.place(a, b)
             moves.append(f"M{_at(across)} {_at(first)}V{_at(self.place(a, c)[1])}")
-        return f'<path d="{"".join(moves)}" stroke="{colour}" stroke-width="0.8"/>'
+        return f'<path d="{"".join(moves)}" stroke="{_SPREAD}" stroke-width="0.8"/>'
 
 
 def series(
@@ -292,7 +293,7 @@ def series(
         ringed = ringed[shown]
         x, y = np.asarray(x, float)[shown], np.asarray(y, float)[shown]
         if half is not None:
-            parts.append(panel.bars(x, y - half[shown], y + half[shown], GREY))
+            parts.append(panel.bars(x, y - half[shown], y + half[shown]))
         pairs = list(zip(x, y, strict=True))
         titles = [f"image {int(a)}: {b:.4g}" if len(x) <= 300 else "" for a, b in pairs]
         parts += panel.stems(x, y, colour, titles)

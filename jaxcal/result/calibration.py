@@ -79,8 +79,8 @@ class Medium:
         blocks: Blocks,
         problem: Problem,
         prior_sd: Float[AnyArray, "*batch k"] | None = None,
-    ) -> Medium | None:
-        """Those of sound speed and delay that are free; None where neither is (traceable).
+    ) -> Medium:
+        """Those of sound speed and delay that are free (traceable).
 
         Args:
             values: of the free further unknowns (:func:`jaxcal.model.unknowns.measured`).
@@ -110,7 +110,7 @@ class Medium:
             found["delay_s"] = xp.asarray(nominal + values["delay"][0] / mm_per_s)
             found["delay_sd_s"] = xp.asarray(step_sd("delay") / mm_per_s)
             found["delay_prior_s"] = prior.get("delay")
-        return cls(**found) if found else None
+        return cls(**found)
 
 
 @array_tree
@@ -216,7 +216,7 @@ class Calibration(OneOrBatch):
         unknowns_covariance: covariance of all unknowns, in the order of ``blocks`` (mm, rad, log
             units); NaN where X is not observable or the solve failed.
         scale_mm_per_px: [lateral, axial], or None for points in mm.
-        medium: sound speed and delay, or None where neither was estimated.
+        medium: sound speed and delay.
         rms: root mean square of ``residual``'s length over the used images, mm.
         mask: 1 for used images.
         status_code: a :class:`Status`.
@@ -249,7 +249,7 @@ class Calibration(OneOrBatch):
     channel_sigma: Float[AnyArray, "*batch"] | None
     unknowns_covariance: Float[AnyArray, "*batch p p"]
     scale_mm_per_px: Float[AnyArray, "*batch 2"] | None
-    medium: Medium | None
+    medium: Medium
     rms: Float[AnyArray, "*batch"]
     mask: Float[AnyArray, "*batch n"]
     status_code: Int[AnyArray, "*batch"]
@@ -290,91 +290,6 @@ class Calibration(OneOrBatch):
     def point_covariance(self) -> Float[AnyArray, "*batch 3 3"]:
         """Covariance of the target in the tracker's frame, mm^2."""
         return self.unknowns_covariance[..., 6:9, 6:9]
-
-    @property
-    def information(self) -> Float[AnyArray, "*batch p p"]:
-        """Information of all unknowns, offsets eliminated, times ``linearisation.variance``."""
-        return self.linearisation.information
-
-    @property
-    def cost(self) -> Float[AnyArray, "*batch"]:
-        """The minimised sum of squares: mm^2 (equal weights) or whitened."""
-        return self.convergence.cost
-
-    @property
-    def stationarity(self) -> Float[AnyArray, "*batch"]:
-        """Scaled KKT residual of the objective."""
-        return self.convergence.stationarity
-
-    @property
-    def tolerance_met(self) -> Bool[AnyArray, "*batch"]:
-        """Whether the method's own stopping rule was met."""
-        return self.convergence.tolerance_met
-
-    @property
-    def iterations(self) -> Int[AnyArray, "*batch"]:
-        """Linearisations (joint, conventional) or rounds (alternating)."""
-        return self.convergence.iterations
-
-    @property
-    def variance_rounds(self) -> Int[AnyArray, "*batch"]:
-        """Passes of the self-tuning that updated the SDs; 0 without it."""
-        return self.convergence.variance_rounds
-
-    @property
-    def searched_start(self) -> Bool[AnyArray, "*batch"]:
-        """Whether the start was found by trying many rotations."""
-        return self.convergence.searched_start
-
-    @property
-    def sigma_floored(self) -> Bool[AnyArray, "*batch 3"]:
-        """Which SDs are at their floor."""
-        return self.convergence.sigma_floored
-
-    @property
-    def rotation_change(self) -> Float[AnyArray, "*batch"]:
-        """X's last move in rad (alternating), else 0."""
-        return self.convergence.rotation_change
-
-    @property
-    def translation_change(self) -> Float[AnyArray, "*batch"]:
-        """X's last move in mm (alternating), else 0."""
-        return self.convergence.translation_change
-
-    @property
-    def trace(self) -> Float[AnyArray, "*batch trace"] | None:
-        """Objective after each of the first iterations; None if no trace was requested."""
-        return self.convergence.trace
-
-    @property
-    def sound_speed_m_s(self) -> Float[AnyArray, "*batch"] | None:
-        """Estimated sound speed, m/s; None where it was not estimated."""
-        return None if self.medium is None else self.medium.sound_speed_m_s
-
-    @property
-    def sound_speed_sd_m_s(self) -> Float[AnyArray, "*batch"] | None:
-        """Standard deviation of the estimated sound speed, m/s."""
-        return None if self.medium is None else self.medium.sound_speed_sd_m_s
-
-    @property
-    def sound_speed_prior_m_s(self) -> Float[AnyArray, "*batch"] | None:
-        """Prior SD of the sound speed, m/s; None without a prior."""
-        return None if self.medium is None else self.medium.sound_speed_prior_m_s
-
-    @property
-    def delay_s(self) -> Float[AnyArray, "*batch"] | None:
-        """Estimated electronic delay, s; None where it was not estimated."""
-        return None if self.medium is None else self.medium.delay_s
-
-    @property
-    def delay_sd_s(self) -> Float[AnyArray, "*batch"] | None:
-        """Standard deviation of the estimated delay, s."""
-        return None if self.medium is None else self.medium.delay_sd_s
-
-    @property
-    def delay_prior_s(self) -> Float[AnyArray, "*batch"] | None:
-        """Prior SD of the delay, s; None without a prior."""
-        return None if self.medium is None else self.medium.delay_prior_s
 
     @property
     def status(self) -> str | np.ndarray:
@@ -553,6 +468,7 @@ class Calibration(OneOrBatch):
             probe_frame=(self.pose_frames or ("Probe",))[0],
             degrees_of_freedom=left if np.isfinite(left) else None,
             variance_factor=float(variance_factor(answer)),
+            doubtful_unit=self.doubtful_unit if self.converged else None,
         )
 
     def plus_matrix(self) -> Float[np.ndarray, "4 4"]:

@@ -148,7 +148,9 @@ def save(
                 known = {key: value for key, value in _record(transform).items() if key in _NPZ}
                 matrix = None if transform.scale_mm_per_px is None else transform.plus_matrix()
                 known |= {"plus_image_to_probe": matrix, "probe_frame": transform.probe_frame}
-                known |= {"tre_factor": transform.tre_factor}
+                known |= {
+                    name: getattr(transform, name) for name in ("tre_factor", "doubtful_unit")
+                }
                 np.savez(file, **{k: v for k, v in known.items() if v is not None})
             else:
                 np.save(file, transform.plus_matrix())
@@ -259,6 +261,7 @@ def _record(transform: ImageTransform) -> dict[str, Any]:
         **{k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in arrays.items()},
         "rms_mm": transform.error_mm if transform.error_is_rms else None,
         "tre": None if transform.tre_factor == 1 else {"factor": transform.tre_factor},
+        "doubtful_unit": transform.doubtful_unit,
         "pose_frames": None if probe == "Probe" else {"from": probe, "to": None},
         "degrees_of_freedom": transform.degrees_of_freedom,
         "variance_factor": transform.variance_factor,
@@ -281,6 +284,10 @@ def load_calibration(path: str | os.PathLike[str]) -> ImageTransform:
             configuration or fCal result of PLUS (``.xml``), a transform of ITK (``.tfm``, ``.txt``,
             ``.h5``), a ``calib_matrix.csv`` of TUS-REC, a YAML of easy_handeye, our ``.npz``, or
             PLUS's matrix as ``.npy``.
+
+    Returns:
+        The calibration. Before its use look at ``converged`` and ``doubtful_unit``, which its
+        ``repr`` shows.
 
     Raises:
         MissingFileError: there is none of this name.
@@ -351,20 +358,7 @@ def stated_source(path: str | os.PathLike[str]) -> str | None:
     Raises:
         FormatError: a ``.json`` that is no JSON object.
     """
-    return _stated_words(path, "source")
-
-
-def stated_doubt(path: str | os.PathLike[str]) -> str | None:
-    """Why a JSON of ours says that its lengths may not be in mm; None if it does not.
-
-    Raises:
-        FormatError: a ``.json`` that is no JSON object.
-    """
-    return _stated_words(path, "doubtful_unit")
-
-
-def _stated_words(path: str | os.PathLike[str], key: str) -> str | None:
-    stated = _stated(path, key)
+    stated = _stated(path, "source")
     return stated if isinstance(stated, str) else None
 
 
@@ -401,6 +395,8 @@ def _load_npz(path: str | os.PathLike[str]) -> ImageTransform:
                 record["pose_frames"] = {"from": file["probe_frame"].tolist()}
             if "tre_factor" in file.files:
                 record["tre"] = {"factor": file["tre_factor"].tolist()}
+            if "doubtful_unit" in file.files:
+                record["doubtful_unit"] = file["doubtful_unit"].tolist()
     except FormatError:
         raise
     except Exception as error:
@@ -449,7 +445,7 @@ def transform_from_record(record: dict[str, Any], *, source: str = "memory") -> 
         found if isinstance(found, dict) else {}
         for found in (record.get("tre"), record.get("pose_frames"))
     )
-    date, named = record.get("date"), frames.get("from")
+    date, named, doubt = record.get("date"), frames.get("from"), record.get("doubtful_unit")
     if not (date is None or isinstance(date, str)):
         raise FormatError("date must be text")
     unknowns = _unknowns(record)
@@ -465,6 +461,7 @@ def transform_from_record(record: dict[str, Any], *, source: str = "memory") -> 
         "covariance": _array(record, "covariance", (6, 6)),
         "image_covariance": _array(record, "image_covariance", (size, size)),
         "probe_frame": named if isinstance(named, str) else None,
+        "doubtful_unit": doubt if isinstance(doubt, str) else None,
     }
     found = ImageTransform(
         matrix,

@@ -95,12 +95,14 @@ class ImageTransform:
             not known.
         error_is_rms: False where ``error_mm`` is what a file of PLUS states, which for fCal is the
             mean of the lowest 95 % of its errors.
+        doubtful_unit: why all lengths may be in another unit than mm, in words; None where nothing
+            is known to speak for it.
 
     Raises:
-        InputError: wrong shapes, ``unknowns`` or ``date``, a ``source`` or ``probe_frame`` that is
-            no text; and, unless ``converged`` is False, NaN or Inf, lengths beyond
-            :data:`~jaxcal.data.recording.LARGEST`, a matrix that is not rigid, sizes or a
-            ``range_factor`` or ``tre_factor`` that are not positive, a negative ``error_mm``,
+        InputError: wrong shapes, ``unknowns`` or ``date``, a ``source``, ``probe_frame`` or
+            ``doubtful_unit`` that is no text; and, unless ``converged`` is False, NaN or Inf,
+            lengths beyond :data:`~jaxcal.data.recording.LARGEST`, a matrix that is not rigid, sizes
+            or a ``range_factor`` or ``tre_factor`` that are not positive, a negative ``error_mm``,
             ``degrees_of_freedom`` or a ``variance_factor`` below 1, a covariance that is not
             symmetric or has negative variances.
     """
@@ -121,6 +123,7 @@ class ImageTransform:
     degrees_of_freedom: float | None = None
     variance_factor: float = 1.0
     error_is_rms: bool = True
+    doubtful_unit: str | None = None
 
     def __post_init__(self) -> None:
         moving = [name for name in TABLE if TABLE[name].in_image]
@@ -143,9 +146,10 @@ class ImageTransform:
             "image_covariance": (size, size),
             "error_mm": (),
         }
-        for name in ("source", "probe_frame"):
-            if not isinstance(getattr(self, name), str):
-                raise InputError(f"{name} must be text, not {shown(getattr(self, name))}")
+        for name in ("source", "probe_frame", "doubtful_unit"):
+            value = getattr(self, name)
+            if not (isinstance(value, str) or (value is None and name == "doubtful_unit")):
+                raise InputError(f"{name} must be text, not {shown(value)}")
         if self.converged is not None:
             check_flag("converged", self.converged)
         if self.date is not None:
@@ -180,6 +184,8 @@ class ImageTransform:
             lines.append(f"SDs along and about the image's axes: {along} mm; {about} deg")
         if self.tre_factor > 1:
             lines.append(f"errors expected by its verdict: {self.tre_factor:.1f} times as large")
+        if self.doubtful_unit is not None:
+            lines.append(f"uncertain: {self.doubtful_unit}")
         if self.converged is False:
             lines.append("must not be used")
         return "\n".join(lines)

@@ -19,9 +19,9 @@ class Convergence:
         tolerance_met: the method's own stopping rule was met.
         iterations: linearisations (joint, conventional) or rounds (alternating).
         variance_rounds: passes of the self-tuning that updated the SDs; 0 without it.
-        searched_start: the start was found by trying many rotations. One problem: no proof was
-            found that the closed form's minimum is the only one. In batches and under
-            transformations, where the start is linear: that was unsound.
+        searched_start: the start is not certain: its closed form was not proved to be the only
+            minimum (one problem), or is unsound (linear, in batches and under transformations), and
+            descents from many rotations were compared.
         sigma_floored: which SDs are at their floor.
         rotation_change: X's last move in rad (alternating), else 0.
         translation_change: X's last move in mm (alternating), else 0.

@@ -176,7 +176,7 @@ def solve(
         point_error=away[1],
         sigma=jnp.asarray(found.sigma),
         status=jnp.asarray(found.status_code, jnp.int8),
-        iterations=jnp.asarray(found.iterations, jnp.int32),
+        iterations=jnp.asarray(found.convergence.iterations, jnp.int32),
     )
 
 

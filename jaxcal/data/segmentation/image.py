@@ -20,11 +20,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import get_args
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxcal import InputError
+from jaxcal.data.names import Target
 from jaxcal.data.recording import MINIMUM_IMAGES, Images, make_images
 from jaxcal.data.segmentation.speckle import (
     SMALLEST_REGION,
@@ -36,7 +38,6 @@ from jaxcal.data.segmentation.speckle import (
 )
 from jaxcal.data.segmentation.spot import (
     Spot,
-    Target,
     brightest,
     fit_spot,
     half_maximum,
@@ -124,7 +125,7 @@ def localise(
             large, options that contradict each other.
     """
     stack = _check_frames(frames)
-    if target not in ("echo", "cross"):
+    if target not in get_args(Target):
         raise InputError(f"target must be echo or cross, not {target!r}")
     if compression not in ("log", "none"):
         raise InputError(f"compression must be log or none, not {compression!r}")

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxcal import InputError
+from jaxcal.data.names import NoiseScale, SegmentationMethod
 from jaxcal.data.probe import MOST_ELEMENTS, CurvilinearProbe, Probe, check_probe
 from jaxcal.data.recording import (
     LARGEST,
@@ -40,14 +41,11 @@ from jaxcal.runtime.given_values import check_flag, is_number, whole_number
 from jaxcal.runtime.jax_modes import in_own_modes
 from jaxcal.runtime.messages import counted, shown
 
-Method = Literal["least-squares", "shortest"]
-Scale = Literal["frame", "pooled"]
-
 MINIMUM_LINES = 8
 """With fewer answers a frame's noise cannot be estimated and an outlier cannot be seen."""
 
 # Least squares have two or three unknowns and a noise.
-_FEWEST_LINES: dict[Method, int] = {"least-squares": 4, "shortest": 1}
+_FEWEST_LINES: dict[SegmentationMethod, int] = {"least-squares": 4, "shortest": 1}
 _LONGEST_S = 2e-3
 # |elevation| is determined where its square lies this many SDs above zero.
 _SIGNIFICANT = 3.0
@@ -116,7 +114,7 @@ class Segmentation:
     """
 
     images: Images
-    method: Method
+    method: SegmentationMethod
     lines: Int[np.ndarray, " n"]
     missing: Int[np.ndarray, " n"]
     rejected: Int[np.ndarray, " n"]
@@ -134,9 +132,9 @@ def segment(
     data: Recording | Images,
     probe: Probe | None = None,
     *,
-    method: Method = "least-squares",
+    method: SegmentationMethod = "least-squares",
     robust: bool = True,
-    scale: Scale = "frame",
+    scale: NoiseScale = "frame",
     interpolate: bool = False,
     minimum_lines: int | None = None,
     minimum_amplitude: float | None = None,
@@ -257,10 +255,17 @@ def segment(
 
 
 def _fewest_lines(
-    method: Method, robust: bool, scale: Scale, interpolate: bool, asked: int | None
+    method: SegmentationMethod,
+    robust: bool,
+    scale: NoiseScale,
+    interpolate: bool,
+    asked: int | None,
 ) -> int:
     """How many answers a frame needs; refuses options that contradict each other."""
-    for name, value, names in (("method", method, Method), ("scale", scale, Scale)):
+    for name, value, names in (
+        ("method", method, SegmentationMethod),
+        ("scale", scale, NoiseScale),
+    ):
         if not (isinstance(value, str) and value in get_args(names)):
             raise InputError(f"{name} must be {' or '.join(get_args(names))}, not {shown(value)}")
     check_flag("robust", robust)
@@ -375,7 +380,7 @@ def _shortest(
     return points, None, np.full(len(points), np.nan), np.zeros(len(points), int)
 
 
-def _fit(distances: np.ndarray, probe: Probe, robust: bool, scale: Scale, failed: np.ndarray):
+def _fit(distances: np.ndarray, probe: Probe, robust: bool, scale: NoiseScale, failed: np.ndarray):
     """Points, covariances, noise, rejected lines; for curved arrays [x, z, y^2] with covariance."""
     curved = isinstance(probe, CurvilinearProbe)
     fits = _fitted(np.asarray(distances, float), probe.element_positions(), (curved, robust))

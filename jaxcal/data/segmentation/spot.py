@@ -18,11 +18,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxcal.data.names import Target
 from jaxcal.data.segmentation.speckle import (
     HALF_MAXIMUM,
     NotFoundError,
@@ -30,8 +31,6 @@ from jaxcal.data.segmentation.speckle import (
     decibel,
     spread,
 )
-
-Target = Literal["echo", "cross"]
 
 FINEST_SD = 0.005
 """Least SD stated for a position, px: no point spread is symmetric enough for a smaller one."""

@@ -9,10 +9,10 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from jaxcal import InputError
+from jaxcal.data.names import Assignment
 from jaxcal.io.folder import first_repeated, rows_by_name
 from jaxcal.io.given_files import naming
 from jaxcal.io.importing.poses_by_time import times_of_table
-from jaxcal.io.importing.sources import Assignment
 from jaxcal.io.sequence import TrackedSequence
 from jaxcal.io.slicer import pixels_from_markups, read_markups
 from jaxcal.io.text import PoseTable

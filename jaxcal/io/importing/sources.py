@@ -10,7 +10,14 @@ from typing import Literal
 import numpy as np
 
 from jaxcal import FormatError, InputError
-from jaxcal.data.names import LengthUnit, Orientation, QuaternionOrder
+from jaxcal.data.names import (
+    Assignment,
+    LengthUnit,
+    Orientation,
+    PointUnit,
+    QuaternionOrder,
+    Target,
+)
 from jaxcal.data.recording import MINIMUM_IMAGES
 from jaxcal.io.folder import read_folder
 from jaxcal.io.sequence import TrackedSequence
@@ -20,10 +27,6 @@ from jaxcal.io.text import PoseTable, read_pose_table
 from jaxcal.io.trackers import is_tracker_export, read_tracker
 from jaxcal.runtime.array_types import Bool, Int
 from jaxcal.runtime.messages import runs_in_words
-
-Assignment = Literal["order", "labels"]
-"""How points without a time or a frame's number are assigned to frames: one for each frame in
-order, or by the frame's number at the end of each point's label."""
 
 
 @dataclass(frozen=True)
@@ -57,13 +60,13 @@ class ImportOptions:
     source: str | None = None
     target: str | None = None
     spacing_mm: tuple[float, float] | None = None
-    units: Literal["px", "mm"] | None = None
+    units: PointUnit | None = None
     quaternion: QuaternionOrder | None = None
     pose_units: LengthUnit | None = None
     skip_invalid: bool = False
     invert_poses: bool = False
     points: Assignment | None = None
-    target_kind: Literal["echo", "cross"] | None = None
+    target_kind: Target | None = None
     region: tuple[int, int, int, int] | None = None
     orientation: Orientation | None = None
     ignore_time: bool = False

@@ -17,7 +17,7 @@ from jaxcal.io.table import first_line
 from jaxcal.io.text import (
     MATRIX_WIDTHS,
     PoseTable,
-    read_crosswire,
+    read_pair,
     recording_of,
     width_without_header,
 )
@@ -40,23 +40,17 @@ def from_tables(sources: Sequence[str | os.PathLike[str]], options: ImportOption
     if two:
         if options.units == "mm":
             raise InputError("a pair of text files holds pixels: --units mm does not go with it")
-        unused = "quaternion", "skip_invalid", "ignore_time", "frames"
+        unused = "quaternion", "skip_invalid", "ignore_time"
         refuse(options, unused, "does not go with a pair of text files, poses and points")
-        with naming_pose_units(options):
-            pair = read_crosswire(
-                *sources,
-                spacing_mm=options.spacing_mm,
-                pose_units=options.pose_units or "mm",
-                invert_poses=options.invert_poses,
-                minimum=options.minimum,
-            )
-        return Imported(pair, [])
-    if len(sources) != 1 or kinds[0] != "table":
+        units, invert = options.pose_units or "mm", options.invert_poses
+        table = read_pair(*sources, pose_units=units, invert_poses=invert)
+    elif len(sources) != 1 or kinds[0] != "table":
         raise InputError(
             f"{os.fspath(sources[0])}: holds no poses: a sequence, a tracker's export or a table "
             "with poses is needed"
         )
-    table = read_rows(sources[0], options, ignore_time=options.ignore_time)
+    else:
+        table = read_rows(sources[0], options, ignore_time=options.ignore_time)
     table, told = _selected_rows(table, options)
     return _from_table(table, table.notes + told, 0, options)
 
