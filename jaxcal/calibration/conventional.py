@@ -91,7 +91,7 @@ def _with_uncertainty(found: ClosedForm, problem: Problem, plan: SolvePlan) -> C
     still = float(convergence.stationarity) <= STATIONARY
     return Calibration(
         image_to_probe=found.image_to_probe,
-        point=found.point_mm,
+        point=found.point,
         elevation=np.where(seen.mask[0] > 0, seen.q[0, :, 1], 0.0),
         sigma=np.sqrt((seen.errors[0] ** 2).sum(axis=0) / component_freedom(used, blocks)),
         offset_law=None,

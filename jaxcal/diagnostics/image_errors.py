@@ -79,7 +79,7 @@ class Unknowns:
             factors = np.asarray(found.scale_mm_per_px) / np.asarray(problem.spacing)
             further["scale"] = list(factors[:, None])
         x = np.asarray(found.image_to_probe)[None]
-        return cls(x[:, :3, :3], x[:, :3, 3], np.asarray(found.point_mm)[None], further)
+        return cls(x[:, :3, :3], x[:, :3, 3], np.asarray(found.point)[None], further)
 
     def moved(self, step: Float[Array, "k p"], blocks: Blocks) -> Unknowns:
         """The unknowns after a step, in the order of ``blocks``."""

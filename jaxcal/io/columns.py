@@ -46,8 +46,8 @@ _OF_HEADER = re.compile(
     r"(?P<field>field\.)?(?:.*\.)?"
     r"(?:header\.(?P<part>seq|stamp|stamp\.secs|stamp\.nsecs|frame_id)|(?P<child>child_frame_id))"
 )
-"""A part of a ROS message's header, or the name of its frame. ``rostopic echo -p`` writes ``field.``
-before it and the stamp in ns, bagpy the stamp as two numbers."""
+"""A part of a ROS message's header, or the name of its frame. ``rostopic echo -p`` writes
+``field.`` before it and the stamp in ns, bagpy the stamp as two numbers."""
 _STAMPS = {"stamp": ("time", "ns"), "stamp.secs": ("time", "s"), "stamp.nsecs": ("nanosec", "ns")}
 """Name and unit of a header's parts that are read."""
 _CELL = re.compile(r"([a-z]*?)_?([0-4])[_,]?([0-4])")

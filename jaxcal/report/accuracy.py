@@ -263,7 +263,7 @@ def _comparison(
         gain = float(density.sum())
         spread = float(np.std(density[used], ddof=1) * math.sqrt(used.sum()))
     return {
-        "conventional_rms_mm": float(other.rms_mm),
+        "conventional_rms_mm": float(other.rms),
         "rms_mm": float(answer.rms),
         "apart_mm": apart_in_image(answer, other, problem, grid),
         "conventional_tre_mm": math.sqrt(error) if error > 0 else None,

@@ -72,7 +72,7 @@ def first_answer_words(images: Images, estimate: tuple[str, ...]) -> str | None:
         scale = f", pixels of {lateral:.4f} x {axial:.4f} mm"
     return (
         f"{name} image origin at {x:.2f}, {y:.2f}, {z:.2f} mm on the probe{scale}, "
-        f"RMS {found.rms_mm:.3f} mm."
+        f"RMS {found.rms:.3f} mm."
     )
 
 

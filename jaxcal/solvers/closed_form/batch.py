@@ -123,10 +123,10 @@ def _unsolved(problems: Problem) -> ClosedForm:
 
     return ClosedForm(
         image_to_probe=nothing(4, 4),
-        point_mm=nothing(3),
+        point=nothing(3),
         scale_mm_per_px=nothing(2) if problems.pixels else None,
         sound_speed_factor=nothing(),
-        rms_mm=nothing(),
+        rms=nothing(),
         objective_mm2=nothing(),
         certified=np.zeros(count, bool),
         gap_mm2=nothing() + np.inf,
@@ -193,10 +193,10 @@ def solve_traceable(problems: Problem, estimate: tuple[str, ...]) -> ClosedForm:
     scale = problems.spacing * lengths.T if scaled else problems.spacing
     return ClosedForm(
         image_to_probe=transform,
-        point_mm=(reduced.centre + target).T,
+        point=(reduced.centre + target).T,
         scale_mm_per_px=scale if problems.pixels else None,
         sound_speed_factor=lengths[1] if constraints.free == ("axial",) else jnp.ones_like(count),
-        rms_mm=jnp.sqrt(objective / count),
+        rms=jnp.sqrt(objective / count),
         objective_mm2=objective,
         certified=certified,
         gap_mm2=jnp.where(definite, gap, jnp.inf),

@@ -89,10 +89,10 @@ class ClosedForm:
 
     Attributes:
         image_to_probe: (4, 4), X, mm.
-        point_mm: (3,), the target in the tracker's frame, mm.
+        point: (3,), the target in the tracker's frame, mm.
         scale_mm_per_px: (2,), [lateral, axial]; None for points in mm.
         sound_speed_factor: the sound speed over the nominal one; 1 where it was not estimated.
-        rms_mm: root mean square of |c - B_i X p_i| over the used images, mm.
+        rms: root mean square of |c - B_i X p_i| over the used images, mm.
         objective_mm2: Eq. 7's sum of squares, mm^2.
         certified: no transform fits Eq. 7 better, up to one part in 1e9 and to rounding.
         gap_mm2: Eq. 7's minimum is at least ``objective_mm2 - gap_mm2``, mm^2.
@@ -100,10 +100,10 @@ class ClosedForm:
     """
 
     image_to_probe: Float[Any, "*batch 4 4"]
-    point_mm: Float[Any, "*batch 3"]
+    point: Float[Any, "*batch 3"]
     scale_mm_per_px: Float[Any, "*batch 2"] | None
     sound_speed_factor: Numbers
-    rms_mm: Numbers
+    rms: Numbers
     objective_mm2: Numbers
     certified: Numbers
     gap_mm2: Numbers
@@ -164,7 +164,7 @@ def closed_form_start(problem: Problem, blocks: Blocks) -> Start:
     parts = {
         "rotation": found.image_to_probe[:3, :3],
         "translation": found.image_to_probe[:3, 3],
-        "point": found.point_mm,
+        "point": found.point,
         "scale": scale,
     }
     dtype = np.asarray(problem.mask).dtype
@@ -458,10 +458,10 @@ def _assemble(
     speed = float(lengths[1]) if reduced.constraints.free == ("axial",) else 1.0
     return ClosedForm(
         image_to_probe=transform,
-        point_mm=point,
+        point=point,
         scale_mm_per_px=scale if data.pixels else None,
         sound_speed_factor=speed,
-        rms_mm=float(np.sqrt(certificate.objective_mm2 / reduced.images)),
+        rms=float(np.sqrt(certificate.objective_mm2 / reduced.images)),
         objective_mm2=certificate.objective_mm2,
         certified=certificate.certified,
         gap_mm2=certificate.gap_mm2,
