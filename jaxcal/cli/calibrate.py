@@ -249,25 +249,14 @@ def calibrate(
     check_request(request)
     _check_apart(targets, report, out)
     from jaxcal.io.given_files import naming
-    from jaxcal.io.hdf5 import load
     from jaxcal.report.accuracy import settle
     from jaxcal.report.convergence import KEPT
     from jaxcal.report.next_poses import next_poses_record
-    from jaxcal.report.record import calibration_record, check_test_images
+    from jaxcal.report.record import calibration_record
     from jaxcal.report.write import prepare_folder, write_report
     from jaxcal.result.saved import dated
 
-    measured, notes = segmented(load(recording))
-    if leave_out:
-        with naming(recording):
-            images = measured.calibration.without(leave_out)
-        measured = replace(measured, calibration=images)
-        notes.append(f"left out as requested: images {runs_in_words(leave_out)}")
-    test_data = None
-    if test is not None:
-        test_data, told = segmented(load(test))
-        notes += [f"{test}: {text}" for text in told]
-    check_test_images(measured, test_data)
+    measured, test_data, notes = _read(recording, leave_out, test)
     _check_exports(measured, targets, inputs)
     prepare_jax()
     with nullcontext() if out is None else prepare_folder(out) as folder:
@@ -304,6 +293,28 @@ def calibrate(
         _print(record, [path for path in (out, report) if path is not None])
         print_page(*exported)
     return verdict_code(record, require)
+
+
+def _read(
+    recording: str, leave_out: tuple[int, ...] | None, test: str | None
+) -> tuple[Recording, Recording | None, list[str]]:
+    """The images to calibrate with, those of a test, and what there is to say of both."""
+    from jaxcal.io.given_files import naming
+    from jaxcal.io.hdf5 import load
+    from jaxcal.report.record import check_test_images
+
+    measured, notes = segmented(load(recording))
+    if leave_out:
+        with naming(recording):
+            images = measured.calibration.without(leave_out)
+        measured = replace(measured, calibration=images)
+        notes.append(f"left out as requested: images {runs_in_words(leave_out)}")
+    test_data = None
+    if test is not None:
+        test_data, told = segmented(load(test))
+        notes += [f"{test}: {text}" for text in told]
+    check_test_images(measured, test_data)
+    return measured, test_data, notes
 
 
 def _export_target(text: str, inputs: list[str], out: str | None) -> tuple[SaveFormat, str]:

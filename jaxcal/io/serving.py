@@ -11,6 +11,7 @@ from collections.abc import Callable
 import numpy as np
 
 from jaxcal import InputError
+from jaxcal.io.given_files import one_line
 from jaxcal.io.message_content import Tracked
 from jaxcal.io.openigtlink import Message, encode
 from jaxcal.runtime.array_types import Float
@@ -60,8 +61,7 @@ class TransformServer:
         # A TypeError: a name that no network has, not in Unicode or with too long a part.
         except (OSError, OverflowError, TypeError) as error:
             self._listener.close()
-            reason = getattr(error, "strerror", None) or str(error)
-            raise InputError(f"cannot listen at {host}:{port}: {reason}") from None
+            raise InputError(f"cannot listen at {host}:{port}: {one_line(error)}") from None
         self._listener.setblocking(False)
         self._selector = selectors.DefaultSelector()
         self._selector.register(self._listener, selectors.EVENT_READ)

@@ -315,33 +315,10 @@ def _scene(record: dict[str, Any], answer: Calibration, recording: Recording) ->
     shown = used[:: max(-(-len(used) // MOST_POSES), 1)]
     x, point = np.asarray(answer.image_to_probe), np.asarray(answer.point)
     poses = recording.calibration.poses[shown]
-    images, seen = poses @ x, targets_in_images(poses, x, point)
+    seen = targets_in_images(poses, x, point)
     # The measured point is in the plane, at the measured lateral position and range.
     cloud = np.asarray(reconstruct(x, poses, seen - np.asarray(answer.residual)[shown]))
-    wide = max(float(np.ptp(seen[:, 0])) / 2, 10.0)
-    deep = float(seen[:, 2].max())
-    middle = float(0.5 * (seen[:, 0].min() + seen[:, 0].max()))
-    across, down = np.array([-1, 1, 1, -1, -1]), np.array([0, 0, 1, 1, 0])
-    corners = np.stack([middle + wide * across, 0.0 * down, deep * down], axis=-1)
-    frames = corners @ np.swapaxes(images[:, :3, :3], 1, 2) + images[:, None, :3, 3]
-    far = np.concatenate([frames.reshape(-1, 3), point[None]])
-    centre = 0.5 * (far.min(axis=0) + far.max(axis=0))
-    lines = [
-        {"points": _rounded(outline), "colour": BLUE, "width": 0.5, "fill": BLUE}
-        for outline in frames[:: max(-(-len(frames) // MOST_PLANES), 1)]
-    ]
-    dots = [
-        {"at": _rounded(frame[:3, 3]), "r": 1.6, "colour": BLUE, "title": f"image {image}"}
-        for frame, image in zip(images, shown.tolist(), strict=True)
-    ]
-    dots.append({"at": _rounded(point), "r": 4, "colour": ORANGE, "title": "target"})
-    whole = {
-        "centre": _rounded(centre),
-        "radius": float(np.linalg.norm(far - centre, axis=1).max()),
-        "lines": lines,
-        "dots": dots,
-        "bar": svg.bar_length(float(np.linalg.norm(np.ptp(far, axis=0)))),
-    }
+    whole = _planes(poses @ x, seen, point, shown)
     close = _close_up(answer, cloud, shown, record["degrees_of_freedom"])
     ellipsoid = ""
     if close["lines"]:
@@ -364,6 +341,42 @@ def _scene(record: dict[str, Any], answer: Calibration, recording: Recording) ->
         f"{_view('scene-target', close, by_image)}</div>",
         f"<p>Target in the tracker's frame: {place}&nbsp;mm.</p>",
     )
+
+
+def _planes(
+    images: Float[np.ndarray, "n 4 4"],
+    seen: Float[np.ndarray, "n 3"],
+    point: Float[np.ndarray, " 3"],
+    shown: np.ndarray,
+) -> dict[str, Any]:
+    """The planes of images in the tracker's frame, as far as targets were ``seen``, and the target.
+
+    ``shown`` are the images' numbers; all lengths are mm.
+    """
+    wide = max(float(np.ptp(seen[:, 0])) / 2, 10.0)
+    deep = float(seen[:, 2].max())
+    middle = float(0.5 * (seen[:, 0].min() + seen[:, 0].max()))
+    across, down = np.array([-1, 1, 1, -1, -1]), np.array([0, 0, 1, 1, 0])
+    corners = np.stack([middle + wide * across, 0.0 * down, deep * down], axis=-1)
+    frames = corners @ np.swapaxes(images[:, :3, :3], 1, 2) + images[:, None, :3, 3]
+    far = np.concatenate([frames.reshape(-1, 3), point[None]])
+    centre = 0.5 * (far.min(axis=0) + far.max(axis=0))
+    lines = [
+        {"points": _rounded(outline), "colour": BLUE, "width": 0.5, "fill": BLUE}
+        for outline in frames[:: max(-(-len(frames) // MOST_PLANES), 1)]
+    ]
+    dots = [
+        {"at": _rounded(frame[:3, 3]), "r": 1.6, "colour": BLUE, "title": f"image {image}"}
+        for frame, image in zip(images, shown.tolist(), strict=True)
+    ]
+    dots.append({"at": _rounded(point), "r": 4, "colour": ORANGE, "title": "target"})
+    return {
+        "centre": _rounded(centre),
+        "radius": float(np.linalg.norm(far - centre, axis=1).max()),
+        "lines": lines,
+        "dots": dots,
+        "bar": svg.bar_length(float(np.linalg.norm(np.ptp(far, axis=0)))),
+    }
 
 
 def _view(name: str, scene: dict[str, Any], words: str) -> str:

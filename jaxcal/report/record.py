@@ -173,21 +173,28 @@ def calibration_record(
         **accuracy_record(result, solved, tre_points),
     }
     if tested is not None:
-        sizes = None if scale is None else np.asarray(scale), tested.spacing_mm
-        whose = "the calibration", "the test images"
-        record["warnings"] = [*result.warnings, *what_differs(("Probe", "Probe"), sizes, whose)]
-        if tested.kind != recording.calibration.kind:
-            record["warnings"].append(
-                f"The test images hold {tested.kind}s, those to calibrate with "
-                f"{recording.calibration.kind}s: do both count from one place? Pixels count from "
-                "the image's corner, points in mm mostly from the middle of the transducer."
-            )
+        record["warnings"] += _other_test_images(tested, recording.calibration, scale)
     if recording.truth is not None:
         record["truth_error"] = truth_error(answer, recording.truth)
     record |= {"source": recording.source, "convention": CONVENTION}
     record["jaxcal_version"] = jaxcal.__version__
     found = plain(record)
     settle(found)
+    return found
+
+
+def _other_test_images(
+    tested: Images, images: Images, scale: Float[np.ndarray, " 2"] | None
+) -> list[str]:
+    """What test images should have in common with those to calibrate with, and have not."""
+    whose = "the calibration", "the test images"
+    found = what_differs(("Probe", "Probe"), (scale, tested.spacing_mm), whose)
+    if tested.kind != images.kind:
+        found.append(
+            f"The test images hold {tested.kind}s, those to calibrate with {images.kind}s: do both "
+            "count from one place? Pixels count from the image's corner, points in mm mostly from "
+            "the middle of the transducer."
+        )
     return found
 
 

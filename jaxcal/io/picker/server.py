@@ -19,6 +19,7 @@ from socketserver import TCPServer
 from typing import Any
 
 from jaxcal import CalibrationError, InputError
+from jaxcal.io.given_files import one_line
 from jaxcal.io.picker.frames import Frames
 from jaxcal.io.picker.picks import Picks
 
@@ -72,8 +73,7 @@ class Picker:
         try:
             self._server = _Server((HOST, port), Handler)
         except (OSError, OverflowError) as error:
-            reason = getattr(error, "strerror", None) or error
-            raise InputError(f"cannot listen at {HOST}:{port}: {reason}") from None
+            raise InputError(f"cannot listen at {HOST}:{port}: {one_line(error)}") from None
         self.port = int(self._server.server_address[1])
         self.url = f"http://{HOST}:{self.port}/{self._token}/"
         self._thread = threading.Thread(target=self._server.serve_forever, args=(0.1,), daemon=True)
