@@ -291,7 +291,8 @@ def numbers(result: jaxcal.Calibration) -> Arrays:
     """What is recorded of an answer (or of a batch of them)."""
 
     def get(name: str) -> np.ndarray:
-        return np.asarray(getattr(result, name))
+        parts = (result, result.convergence, result.medium)
+        return np.asarray(next(getattr(part, name) for part in parts if hasattr(part, name)))
 
     found = {
         "image_to_probe": get("image_to_probe")[..., :3, :],
@@ -320,16 +321,13 @@ def numbers(result: jaxcal.Calibration) -> Arrays:
         "at_bound",
     ):
         found[name] = get(name).astype(bool)
-    for name in (
-        "scale_mm_per_px",
-        "channel_sigma",
-        "sound_speed_m_s",
-        "sound_speed_sd_m_s",
-        "delay_s",
-        "delay_sd_s",
+    for part, names in (
+        (result, ("scale_mm_per_px", "channel_sigma")),
+        (result.medium, ("sound_speed_m_s", "sound_speed_sd_m_s", "delay_s", "delay_sd_s")),
     ):
-        if getattr(result, name) is not None:
-            found[name] = get(name)
+        for name in names:
+            if getattr(part, name) is not None:
+                found[name] = get(name)
     law = result.offset_law
     if law is not None:
         for name in ("mean", "mean_sd", *PROBABILITIES):
