@@ -20,11 +20,12 @@ from jaxcal.report.convergence import KEPT, Curve, bounded_curves
 from jaxcal.report.next_poses import next_poses_record, next_poses_sentences
 from jaxcal.report.paragraphs import laid_out, listed
 from jaxcal.report.plots import convergence_figure, plot_offsets, plot_residuals
-from jaxcal.report.record import calibration_record, check_test_images, plain, truth_error
+from jaxcal.report.record import calibration_record, check_test_images, truth_error
 from jaxcal.report.tables import calibration_table, comparison_table, frames_and_target
 from jaxcal.report.verdict import certainty, frames_of_images, verdict
 from jaxcal.report.write import COLUMNS, prepare_folder, write_report
 from jaxcal.result.calibration import Status
+from jaxcal.runtime.arrays import plain
 from jaxcal.solvers.plan import Options
 from jaxcal.study.simulation import Protocol, simulate_recording
 

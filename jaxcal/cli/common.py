@@ -181,8 +181,10 @@ def _only_processor() -> None:
 
 
 def print_json(record: dict[str, Any]) -> None:
-    """One JSON object on one line of standard output."""
-    click.echo(json.dumps(record, allow_nan=False))
+    """One JSON object on one line of standard output; arrays as lists, null for NaN and Inf."""
+    from jaxcal.runtime.arrays import plain
+
+    click.echo(json.dumps(plain(record), allow_nan=False))
 
 
 def simple_table(headings: Iterable[str], words: Iterable[str]) -> Table:

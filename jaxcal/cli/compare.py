@@ -131,17 +131,15 @@ def _notes(calibrations: tuple[str, ...], transforms: list[ImageTransform]) -> l
 
 
 def _record(first: str, second: str, found: Comparison) -> dict[str, Any]:
-    from jaxcal.runtime.arrays import finite_or_none
-
     return {
         "first": first,
         "second": second,
-        "points": found.points.tolist(),
-        "apart_mm": found.apart_mm.tolist(),
-        "expected_mm": [finite_or_none(value) for value in found.expected_mm],
+        "points": found.points,
+        "apart_mm": found.apart_mm,
+        "expected_mm": found.expected_mm,
         "rms_mm": found.rms_mm,
-        "expected_rms_mm": finite_or_none(found.expected_rms_mm),
-        "limit_95_mm": finite_or_none(found.limit_mm),
+        "expected_rms_mm": found.expected_rms_mm,
+        "limit_95_mm": found.limit_mm,
         "rotation_deg": found.rotation_deg,
         "agree": found.agree,
         "same": _are_same(found),

@@ -367,8 +367,8 @@ def _record(
             "radius_mm": region.radius_mm,
         },
         "images_before": found.known.images,
-        "tre_mm": found.tre_mm.tolist(),
-        "rp_mm": found.rp_mm.tolist(),
+        "tre_mm": found.tre_mm,
+        "rp_mm": found.rp_mm,
         "images_to_tre_mm": counted,
         "poses": pose_records(found, result),
     }

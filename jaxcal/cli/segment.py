@@ -205,7 +205,7 @@ def _frames_record(
         **{name.replace(" ", "_"): count for name, count in found.counts.items()},
         "reasons": found.reasons,
         "images": len(images),
-        "spacing_mm": None if images.spacing_mm is None else images.spacing_mm.tolist(),
+        "spacing_mm": images.spacing_mm,
         "per_frame": [
             {
                 **({"file": found.files[k]} if found.files else {"frame": k}),
@@ -239,7 +239,7 @@ def _record(found: Segmentation, target: str) -> dict[str, Any]:
         "method": found.method,
         "images": len(kept),
         "images_used": int(kept.sum()),
-        "images_failed": np.flatnonzero(found.failed).tolist(),
+        "images_failed": np.flatnonzero(found.failed),
         "missing_lines": int(found.missing.sum()),
         "rejected_lines": int(found.rejected.sum()),
         "noise_mm": float(np.median(noise)) if noise.size else None,

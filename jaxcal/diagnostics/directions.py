@@ -8,7 +8,7 @@ from jaxcal.model.unknowns import TABLE, block_slice
 from jaxcal.result.calibration import Calibration, check_one
 from jaxcal.result.diagnostics import ADDITIONS
 from jaxcal.runtime.array_types import AnyArray
-from jaxcal.runtime.arrays import finite_or_none
+from jaxcal.runtime.arrays import plain
 from jaxcal.runtime.messages import enumerated
 
 _LEADING = 0.35
@@ -64,9 +64,9 @@ def observability(result: Calibration) -> dict[str, float | str | None]:
     if np.any(result.prior_direction != 0):
         from_prior = direction_in_words(result.prior_direction, result.blocks)
     return {
-        "condition": finite_or_none(result.condition),
+        "condition": plain(result.condition),
         "weakest_direction": direction_in_words(result.weakest, result.blocks),
-        "weakest_sd_mm": finite_or_none(result.weakest_sd),
+        "weakest_sd_mm": plain(result.weakest_sd),
         "known_only_from_prior": from_prior,
         "advice": poses_to_add(result),
     }

@@ -8,7 +8,6 @@ from jaxcal.diagnostics.residual_checks import FEWEST_TO_CHECK
 from jaxcal.result.calibration import Calibration
 from jaxcal.result.diagnostics import MISFITS
 from jaxcal.runtime.array_types import AnyArray
-from jaxcal.runtime.arrays import finite_or_none
 
 MISFIT_SCORE = 3.3
 """A standard normal score beyond this contradicts the noise model. Where the model holds, one data
@@ -27,11 +26,8 @@ def noise_model(result: Calibration) -> dict[str, object]:
     scores = np.asarray(result.inspection.misfit, dtype=float)
     return {
         "checked": int(result.images_used) >= FEWEST_TO_CHECK,
-        "kurtosis": [finite_or_none(value) for value in result.inspection.kurtosis],
-        "scores": {
-            name: [finite_or_none(value) for value in row]
-            for name, row in zip(MISFITS, scores, strict=True)
-        },
+        "kurtosis": result.inspection.kurtosis,
+        "scores": dict(zip(MISFITS, scores, strict=True)),
         "complaints": misfits(result),
     }
 

@@ -11,7 +11,7 @@ from jaxcal.diagnostics.image_errors import KINDS
 from jaxcal.diagnostics.residual_checks import FEWEST_TO_CHECK
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import AnyArray
-from jaxcal.runtime.arrays import finite_or_none
+from jaxcal.runtime.arrays import plain
 
 SUSPECTED = 0.01
 """Share of recordings with Gaussian errors in which chance alone makes an image suspect."""
@@ -66,7 +66,7 @@ def outlier_reasons(
         reason: OutlierReason = {
             "image": image,
             "component": components[worst],
-            "sds": finite_or_none(studentised[image, worst]),
+            "sds": plain(studentised[image, worst]),
             "left_out": bool(np.asarray(result.mask)[image] == 0),
         }
         found.append(reason)
@@ -102,7 +102,7 @@ def suspects(result: Calibration) -> list[OutlierReason]:
         {
             "image": int(image),
             "component": KINDS[1],
-            "sds": finite_or_none(error[image]),
+            "sds": plain(error[image]),
             "left_out": False,
         }
         for image in np.flatnonzero(np.abs(error) > limit)

@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxcal.calibration.pivot import AXES, Pivot
 from jaxcal.diagnostics.outliers import outlier_reasons, outliers
-from jaxcal.report.record import plain
+from jaxcal.runtime.arrays import plain
 from jaxcal.runtime.messages import counted
 
 

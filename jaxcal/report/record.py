@@ -30,6 +30,7 @@ from jaxcal.report.differences import what_differs
 from jaxcal.result.calibration import Calibration
 from jaxcal.result.saved import FORMAT, VERSION
 from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.arrays import plain
 from jaxcal.runtime.messages import quoted
 
 CONVENTION = {
@@ -274,19 +275,6 @@ def check_test_images(recording: Recording, test: Recording | None = None) -> Im
             "calibrate with: a test set is independent, recorded apart"
         )
     return images
-
-
-def plain(value: Any) -> Any:
-    """Arrays as lists, numpy's scalars as Python's, and null for whatever is not finite."""
-    if isinstance(value, dict):
-        return {key: plain(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray | np.generic):
-        return plain(value.tolist())
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
 
 
 def _precision(result: Calibration, images: Images) -> float | None:

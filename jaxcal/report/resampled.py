@@ -9,8 +9,8 @@ import numpy as np
 
 from jaxcal.diagnostics.residual_checks import FEWEST_TO_CHECK
 from jaxcal.report.accuracy import stated_at
-from jaxcal.report.record import plain
 from jaxcal.result.calibration import Calibration
+from jaxcal.runtime.arrays import plain
 
 if TYPE_CHECKING:
     from jaxcal.calibration.resampling import Bootstrap, CrossValidation

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import math
 import re
 import sys
 from collections.abc import Callable
@@ -204,10 +205,15 @@ def _axis_of_images(annotation: str) -> int | None:
     return names.index("n") - len(names) if "n" in names else None
 
 
-def finite_or_none(value: Any) -> float | None:
-    """A number for JSON, which knows neither NaN nor infinity."""
-    number = float(value)
-    return number if np.isfinite(number) else None
+def plain(value: Any) -> Any:
+    """For JSON: numpy's arrays as lists, its scalars as Python's, None for what is not finite."""
+    if isinstance(value, dict):
+        return {key: plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _register(kind: type) -> None:
