@@ -428,16 +428,14 @@ def _close_up(
     }
 
 
-def square_within(freedom: float | None, probability: float = 0.95) -> float:
-    """The square, in SDs, below which a vector along three axes is with this probability.
+def square_within(freedom: float | None) -> float:
+    """The square, in SDs, below which a vector along three axes is with a probability of 95 %.
 
-    Args:
-        freedom: degrees of freedom of Student's distribution; None if the vector is normal.
-        probability: of the vector to be inside.
+    ``freedom`` are the degrees of freedom of Student's distribution; None if it is normal.
     """
     if freedom is None:
-        return float(special.chdtri(3, 1 - probability))
-    return 3 * float(special.fdtri(3, freedom, probability))
+        return float(special.chdtri(3, 0.05))
+    return 3 * float(special.fdtri(3, freedom, 0.95))
 
 
 def _rounded(values: Any) -> Any:

@@ -205,7 +205,8 @@ class Calibration(OneOrBatch):
     is an error.
 
     Attributes:
-        image_to_probe: X, mm.
+        image_to_probe: X, rigid, mm. In files and in :class:`jaxcal.ImageTransform`, beside PLUS's
+            ImageToProbe, which includes the pixel size, it is ``image_plane_to_probe``.
         point: target in the tracker's frame, mm.
         elevation: estimated elevational offset of the target in every image (q_iy), mm; 0 where an
             image was left out.

@@ -70,7 +70,8 @@ class ImageTransform:
     """A calibration without the data from which it was made.
 
     Attributes:
-        image_plane_to_probe: (4, 4) X, rigid, mm, from (lateral, elevational, axial).
+        image_plane_to_probe: (4, 4) X, rigid, mm, from (lateral, elevational, axial); the
+            ``image_to_probe`` of :class:`jaxcal.Calibration`, and not PLUS's (:meth:`plus_matrix`).
         scale_mm_per_px: [lateral, axial]; None where points were in mm.
         face_offset_mm: range of pixel row 0, or of a measured range of 0, mm.
         covariance: (6, 6) of X's right perturbation X Exp([v, omega]), mm and rad; None if unknown.
