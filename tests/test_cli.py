@@ -35,6 +35,7 @@ from jaxcal.data.recording import Recording, make_images
 from jaxcal.design.constraints import Region
 from jaxcal.io.atomic import save_figure
 from jaxcal.io.outputs import begins_with, check_output
+from jaxcal.report.paragraphs import Verbatim
 from jaxcal.result.transform import ImageTransform
 from jaxcal.runtime import jax_cache, program_cache
 from jaxcal.runtime.messages import command_line
@@ -715,7 +716,7 @@ def test_messages_are_not_markup(capfd):
 def test_commands_and_paths_are_not_broken(capfd):
     path = "/home/lab" + "/2026-11-24" * 12 + "/rec.h5"
     command = f"jaxcal calibrate {path} --report report.html"
-    common.print_page(f"the images are in {path} as before", common.Verbatim(command), "end")
+    common.print_page(f"the images are in {path} as before", Verbatim(command), "end")
     lines = capfd.readouterr().out.splitlines()
     assert lines == ["the images are in", path, "as before", command, "end"]
 

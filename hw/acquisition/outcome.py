@@ -37,9 +37,10 @@ def calibrate_and_print(path: str, *lines: str) -> dict[str, Any]:
 
 def _calibrated(path: str, lines: tuple[str, ...], hint: list[str]) -> dict[str, Any]:
     from jaxcal.calibration.calibrate import calibrate
-    from jaxcal.cli.common import Verbatim, print_page, segmented
+    from jaxcal.cli.common import print_page, segmented
     from jaxcal.io.given_files import naming
     from jaxcal.io.hdf5 import load
+    from jaxcal.report.paragraphs import Verbatim
     from jaxcal.report.record import calibration_record
     from jaxcal.report.tables import calibration_table
     from jaxcal.report.verdict import verdict

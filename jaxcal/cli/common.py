@@ -13,7 +13,6 @@ import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -199,31 +198,14 @@ def simple_table(headings: Iterable[str], words: Iterable[str]) -> Table:
     return table
 
 
-class Verbatim(str):
-    """A line that is not wrapped, so that it can be copied: a command."""
-
-
 def print_page(*parts: RenderableType) -> None:
     """Print tables, sentences wrapped to the page, and verbatim lines, on standard output."""
-    from rich.console import Console
-
-    from jaxcal.report.paragraphs import laid_out
+    from jaxcal.report.paragraphs import page_text
 
     # What goes to a file or a pipe must not be cut to the width of no terminal.
     width = None if sys.stdout is not None and sys.stdout.isatty() else 100
-    # Nothing in a message or a file's name is to be taken for markup.
-    page = Console(markup=False, highlight=False, emoji=False, width=width)
-    with page.capture() as captured:
-        for kind, group in groupby(parts, key=type):
-            if kind is Verbatim:
-                for line in group:
-                    page.print(line, soft_wrap=True)
-            elif kind is str:
-                page.print(laid_out([str(part) for part in group], page.width), soft_wrap=True)
-            else:
-                page.print(*group)
     # Not straight from rich, which leaves the process when the pipe is closed early.
-    click.echo(captured.get(), nl=False)
+    click.echo(page_text(parts, width, styled=True), nl=False)
 
 
 def segmented(recording: Recording) -> tuple[Recording, list[str]]:

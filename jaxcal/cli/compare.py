@@ -10,12 +10,12 @@ import click
 
 from jaxcal.cli.common import (
     ExitCode,
-    Verbatim,
     json_option,
     print_json,
     print_page,
     simple_table,
 )
+from jaxcal.report.paragraphs import Verbatim
 from jaxcal.runtime.messages import counted
 
 if TYPE_CHECKING:

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import click
 
-from jaxcal.cli.common import POSITIVE, ImageNumbers, Verbatim
+from jaxcal.cli.common import POSITIVE, ImageNumbers
 from jaxcal.data.names import LengthUnit, Orientation, QuaternionOrder, Target
+from jaxcal.report.paragraphs import Verbatim
 from jaxcal.runtime.messages import command_line
 
 if TYPE_CHECKING:

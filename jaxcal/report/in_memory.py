@@ -7,7 +7,6 @@ their poses are not looked for.
 
 from __future__ import annotations
 
-import io
 from html import escape
 from typing import Any
 
@@ -56,25 +55,13 @@ def record_of(
 
 def text_of(calibration: Calibration, width: int = 100) -> str:
     """Table and verdict, as a terminal shows them."""
-    from rich.console import Console
-
-    from jaxcal.report.paragraphs import laid_out
+    from jaxcal.report.paragraphs import page_text
     from jaxcal.report.tables import calibration_table
     from jaxcal.report.verdict import verdict
 
     record = record_of(calibration)
-    console = Console(
-        file=io.StringIO(),
-        width=width,
-        markup=False,
-        highlight=False,
-        emoji=False,
-        color_system=None,
-    )
-    with console.capture() as captured:
-        console.print(calibration_table(record))
-    table = "\n".join(line.rstrip() for line in captured.get().splitlines())
-    return table + "\n" + laid_out(verdict(record), width)
+    text = page_text([calibration_table(record), *verdict(record)], width)
+    return "\n".join(line.rstrip() for line in text.splitlines())
 
 
 def batch_text(calibration: Calibration) -> str:

@@ -1,4 +1,4 @@
-"""Sentences, headings and lists as plain text of a given width.
+"""Sentences, headings and lists as text of a given width, alone or with tables, and as HTML.
 
 A paragraph is a string without line breaks. One that starts with ``BULLET`` is a point of a list;
 one that ends with a colon, with points after it, is their heading.
@@ -8,8 +8,13 @@ from __future__ import annotations
 
 import re
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from html import escape
+from itertools import groupby
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
 
 BULLET = "- "
 
@@ -39,6 +44,40 @@ def laid_out(lines: Sequence[str], width: int) -> str:
         )
         told.append(filled.replace("\0", " "))
     return "\n".join(told)
+
+
+class Verbatim(str):
+    """A line that is not wrapped, so that it can be copied: a command."""
+
+
+def page_text(parts: Iterable[RenderableType], width: int | None, *, styled: bool = False) -> str:
+    """Tables, paragraphs and verbatim lines, one below the other, as a terminal shows them.
+
+    Args:
+        parts: tables of rich, paragraphs (str) and :class:`Verbatim` lines.
+        width: of the page; None: that of the terminal.
+        styled: whether bold type and colours may be in the text, where the terminal has them.
+    """
+    from rich.console import Console
+
+    # Nothing in a message or a file's name is to be taken for markup.
+    page = Console(
+        markup=False,
+        highlight=False,
+        emoji=False,
+        width=width,
+        color_system="auto" if styled else None,
+    )
+    with page.capture() as captured:
+        for kind, group in groupby(parts, key=type):
+            if kind is Verbatim:
+                for line in group:
+                    page.print(line, soft_wrap=True)
+            elif kind is str:
+                page.print(laid_out([str(part) for part in group], page.width), soft_wrap=True)
+            else:
+                page.print(*group)
+    return captured.get()
 
 
 def as_html(lines: Sequence[str]) -> str:
