@@ -309,7 +309,9 @@ def test_the_header_of_a_ros_message_gives_the_time(tmp_path):
     table = read_pose_table(path, pose_units="m")
     np.testing.assert_allclose(table.time, start + 1.1 * np.arange(6), atol=1e-6)
     assert table.notes == [f"{path}: columns that are not read: 'Time', 'header.frame_id'"]
-    path.write_text("\n".join([",".join(["frame", *names[1:]]), *rows]).replace(".secs", ".seq"))
+    path.write_text(
+        "\n".join([",".join(["frame", *names[1:]]), *rows]).replace("header.stamp.secs", "comment")
+    )
     with pytest.raises(FormatError, match="nanoseconds of a time, but not its seconds"):
         read_pose_table(path)
 

@@ -210,7 +210,7 @@ def _compared(
         influence=_length_in_sds(moved, result.covariance),
         image_to_probe=fits.image_to_probe,
         converged=xp.asarray(fits.converged),
-        fold_cost=held.cost,
+        fold_cost=held.convergence.cost,
         mask=mask,
         image_moved=image_moved,
         image_points=points,

@@ -322,7 +322,8 @@ def _export_target(text: str, inputs: list[str], out: str | None) -> tuple[SaveF
     from jaxcal.result.saved import check_target
 
     name, colon, path = text.partition(":")
-    format = next((each for each in TEXTS if each == name), None)
+    known: dict[str, SaveFormat] = {each: each for each in TEXTS}
+    format = known.get(name)
     if not colon or not path or format is None:
         raise InputError(f"--export {text}: FORMAT:PATH is needed, of {', '.join(TEXTS)}")
     if format != "plus":

@@ -174,7 +174,9 @@ def calibration_record(
         **accuracy_record(result, solved, tre_points),
     }
     if tested is not None:
-        record["warnings"] += _other_test_images(tested, recording.calibration, scale)
+        record["warnings"] += _other_test_images(
+            tested, recording.calibration, None if scale is None else np.asarray(scale)
+        )
     if recording.truth is not None:
         record["truth_error"] = truth_error(answer, recording.truth)
     record |= {"source": recording.source, "convention": CONVENTION}
