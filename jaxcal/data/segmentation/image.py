@@ -27,7 +27,6 @@ from jaxtyping import Bool, Float
 
 from jaxcal import InputError
 from jaxcal.data.names import Target
-from jaxcal.data.recording import MINIMUM_IMAGES, Images, make_images
 from jaxcal.data.segmentation.speckle import (
     SMALLEST_REGION,
     Compression,
@@ -50,6 +49,8 @@ MAXIMUM_FRAMES = 100_000
 """Most frames in one call."""
 LARGEST_SPOT = 0.25
 """A spot whose SD is more than this fraction of the region is a structure, not a target."""
+_LEAST_MARGIN_DB = 3.0
+"""If the next bright spot is nearer in brightness, it is not certain which one is the target."""
 _CUT = 10 ** (-36 / 20)
 """A spot that falls below this share of its peak, beside a pixel above half of it, is cut off."""
 
@@ -94,7 +95,6 @@ def localise(
     compression: Compression = "log",
     decibels_per_level: float | None = None,
     false_alarm: float = 1e-3,
-    minimum_margin_db: float = 3.0,
     target_sd_px: float | tuple[float, float] = 0.0,
 ) -> Localisation:
     """Find the active echo spot or the cross-wire in every frame.
@@ -112,7 +112,6 @@ def localise(
             60 / 255). None: measured on the speckle or, where the background is black, 60 dB over
             the display's range.
         false_alarm: accepted probability that mere speckle is taken for a target in a frame.
-        minimum_margin_db: least distance to the next bright spot, dB.
         target_sd_px: SD of the place that the echo comes from about the target's position, px, one
             number or [u, v]. Its square is added to the covariance. No single frame shows it.
 
@@ -136,15 +135,13 @@ def localise(
             raise InputError("decibels_per_level belongs to log-compressed frames")
     if not 0 < false_alarm < 1:
         raise InputError(f"false_alarm must be between 0 and 1, not {false_alarm!r}")
-    if not (np.isfinite(minimum_margin_db) and minimum_margin_db >= 0):
-        raise InputError(f"minimum_margin_db must be zero or positive, not {minimum_margin_db!r}")
     first_column, first_row, columns, rows = check_region(region, stack.shape[1:])
     expected, radius = _check_near(near, within_px, len(stack))
     scatter = np.asarray(target_sd_px, dtype=float)
     if scatter.shape not in ((), (2,)) or not (np.isfinite(scatter) & (scatter >= 0)).all():
         raise InputError(f"target_sd_px must be one or two numbers >= 0, not {target_sd_px!r}")
     corner = np.array([first_column, first_row], dtype=float)
-    how = (compression, decibels_per_level, false_alarm, minimum_margin_db)
+    how = (compression, decibels_per_level, false_alarm)
     spots = []
     for index, frame in enumerate(stack):
         part = frame[first_row : first_row + rows, first_column : first_column + columns]
@@ -165,63 +162,6 @@ def localise(
         width=stacked("width", 2),
         reason=tuple(spot.reason for spot in spots),
     )
-
-
-def images_from_frames(
-    frames: np.ndarray,
-    poses: np.ndarray,
-    target: Target = "echo",
-    *,
-    spacing_mm: np.ndarray | tuple[float, float] | None = None,
-    face_offset_mm: float = 0.0,
-    time: np.ndarray | None = None,
-    minimum: int = MINIMUM_IMAGES,
-    **options,
-) -> tuple[Images, Localisation]:
-    """Localise the target in tracked frames and make them images to calibrate with.
-
-    Args:
-        frames: (n, rows, columns), see :func:`localise`.
-        poses: (n, 4, 4) probe -> tracker, mm.
-        target: ``echo`` or ``cross``.
-        spacing_mm: [lateral, axial] mm per px; None where unknown.
-        face_offset_mm: range of pixel row 0, mm.
-        time: (n,) s.
-        minimum: least number of frames with a target.
-        **options: of :func:`localise`.
-
-    Returns:
-        Images of kind ``pixel`` with covariances, in which frames without a credible target are
-        masked; and the localisation with its reasons.
-
-    Raises:
-        InputError: see :func:`localise` and :func:`jaxcal.make_images`; numbers of poses and
-            frames that differ; too few frames with a target.
-    """
-    located = localise(frames, target, **options)
-    if len(poses) != len(located):
-        raise InputError(f"{len(poses)} poses but {len(located)} frames: they must match")
-    used = int(located.found.sum())
-    if used < minimum:
-        reasons = [reason for reason in located.reason if reason]
-        most = max(set(reasons), key=reasons.count) if reasons else "there are no frames"
-        raise InputError(
-            f"only {used} of {len(located)} frames show a credible target, at least {minimum} are "
-            f"needed (most often: {most})"
-        )
-    images = make_images(
-        poses,
-        located.position,
-        "pixel",
-        mask=located.found,
-        covariance=located.covariance,
-        time=time,
-        spacing_mm=spacing_mm,
-        face_offset_mm=face_offset_mm,
-        frame_size=np.shape(frames)[:-3:-1],
-        minimum=minimum,
-    )
-    return images, located
 
 
 def _check_frames(frames: np.ndarray) -> np.ndarray:
@@ -302,7 +242,6 @@ def _localise_one(
     compression: Compression,
     decibels_per_level: float | None,
     false_alarm: float,
-    minimum_margin_db: float,
 ) -> Spot:
     """The target in one region, or why there is none; positions count from its first pixel."""
     contrast = margin = np.nan
@@ -328,7 +267,7 @@ def _localise_one(
                 f"nothing stands out: the brightest spot is {contrast:.1f} dB over the background, "
                 f"speckle alone reaches {needed:.1f} dB"
             )
-        if margin < minimum_margin_db:
+        if margin < _LEAST_MARGIN_DB:
             raise NotFoundError(
                 f"ambiguous, several bright spots: the next is only {margin:.1f} dB below"
             )
