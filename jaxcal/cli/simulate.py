@@ -36,7 +36,8 @@ from jaxcal.study.laws import OFFSET_LAWS, LawName
     type=click.Choice(OFFSET_LAWS),
     default="uniform",
     show_default=True,
-    help="How the elevational offsets are distributed.",
+    metavar="LAW",
+    help=f"How the elevational offsets are distributed: {', '.join(OFFSET_LAWS)}.",
 )
 @click.option(
     "--noise",
