@@ -332,7 +332,7 @@ def test_other_solvers_tune_sds_in_float32():
     found = jaxcal.calibrate(problem, prior="gaussian", options=given)
     exact = jaxcal.calibrate(problem, prior="gaussian")
     assert found.converged
-    assert found.variance_rounds < 20
+    assert found.convergence.variance_rounds < 20
     np.testing.assert_allclose(found.sigma, exact.sigma, rtol=1e-2)
     given = jaxcal.Options(solver=optx.Dogleg(1e-5, 1e-5), precision=precision)
     with pytest.raises(jaxcal.InputError, match="Dogleg does not run in float32"):
