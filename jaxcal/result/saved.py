@@ -42,6 +42,7 @@ _NPZ = (
     "date",
     "degrees_of_freedom",
     "variance_factor",
+    "doubtful_unit",
 )
 _ROUNDED = 1e-4
 """Relative difference of the columns of two matrices of a record that rounding explains."""
@@ -148,9 +149,7 @@ def save(
                 known = {key: value for key, value in _record(transform).items() if key in _NPZ}
                 matrix = None if transform.scale_mm_per_px is None else transform.plus_matrix()
                 known |= {"plus_image_to_probe": matrix, "probe_frame": transform.probe_frame}
-                known |= {
-                    name: getattr(transform, name) for name in ("tre_factor", "doubtful_unit")
-                }
+                known |= {"tre_factor": transform.tre_factor}
                 np.savez(file, **{k: v for k, v in known.items() if v is not None})
             else:
                 np.save(file, transform.plus_matrix())
@@ -395,8 +394,6 @@ def _load_npz(path: str | os.PathLike[str]) -> ImageTransform:
                 record["pose_frames"] = {"from": file["probe_frame"].tolist()}
             if "tre_factor" in file.files:
                 record["tre"] = {"factor": file["tre_factor"].tolist()}
-            if "doubtful_unit" in file.files:
-                record["doubtful_unit"] = file["doubtful_unit"].tolist()
     except FormatError:
         raise
     except Exception as error:
