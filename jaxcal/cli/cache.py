@@ -20,8 +20,8 @@ from jaxcal.cli.common import (
     print_json,
     print_page,
     progress,
-    simple_table,
 )
+from jaxcal.report.paragraphs import simple_table
 from jaxcal.runtime import jax_cache, program_cache
 from jaxcal.runtime.messages import counted
 from jaxcal.solvers.names import Method

@@ -21,7 +21,6 @@ from jaxcal import InputError
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
-    from rich.table import Table
 
     from jaxcal.data.recording import Recording
 
@@ -184,18 +183,6 @@ def print_json(record: dict[str, Any]) -> None:
     from jaxcal.runtime.arrays import plain
 
     click.echo(json.dumps(plain(record), allow_nan=False))
-
-
-def simple_table(headings: Iterable[str], words: Iterable[str]) -> Table:
-    """A table without lines, in which the columns of ``words`` begin at the left, others do not."""
-    from rich import box
-    from rich.table import Table
-
-    table, left = Table(box=box.SIMPLE), set(words)
-    for heading in headings:
-        # Folded: a narrow terminal would cut off the ends of words, and paths would look alike.
-        table.add_column(heading, justify="left" if heading in left else "right", overflow="fold")
-    return table
 
 
 def print_page(*parts: RenderableType) -> None:

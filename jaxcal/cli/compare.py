@@ -13,9 +13,8 @@ from jaxcal.cli.common import (
     json_option,
     print_json,
     print_page,
-    simple_table,
 )
-from jaxcal.report.paragraphs import Verbatim
+from jaxcal.report.paragraphs import Verbatim, simple_table
 from jaxcal.runtime.messages import counted
 
 if TYPE_CHECKING:

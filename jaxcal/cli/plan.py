@@ -22,11 +22,11 @@ from jaxcal.cli.common import (
     progress,
     seed_option,
     segmented,
-    simple_table,
 )
 from jaxcal.data.names import ProbeKind
 from jaxcal.design.names import Criterion
 from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
+from jaxcal.report.paragraphs import simple_table
 from jaxcal.study.laws import OFFSET_LAWS, LawName
 
 if TYPE_CHECKING:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
+    from rich.table import Table
 
 BULLET = "- "
 
@@ -44,6 +45,18 @@ def laid_out(lines: Sequence[str], width: int) -> str:
         )
         told.append(filled.replace("\0", " "))
     return "\n".join(told)
+
+
+def simple_table(headings: Iterable[str], words: Iterable[str]) -> Table:
+    """A table without lines, in which the columns of ``words`` begin at the left, others do not."""
+    from rich import box
+    from rich.table import Table
+
+    table, left = Table(box=box.SIMPLE), set(words)
+    for heading in headings:
+        # Folded: a narrow terminal would cut off the ends of words, and paths would look alike.
+        table.add_column(heading, justify="left" if heading in left else "right", overflow="fold")
+    return table
 
 
 class Verbatim(str):

@@ -10,6 +10,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 
 from jaxcal.report.certified import certificate_words
+from jaxcal.report.paragraphs import simple_table
 from jaxcal.report.verdict import fine_form, length_form, spread_of_transform, title_of_transform
 from jaxcal.result.saved import ASKED_FOR
 from jaxcal.runtime.messages import counted
@@ -37,18 +38,15 @@ def calibration_table(record: dict[str, Any]) -> RenderableType:
 
 def comparison_table(records: dict[str, dict[str, Any]], milliseconds: dict[str, float]) -> Table:
     """Several calibrations of one recording by name, a row each, with the times of their solves."""
-    table = Table(box=box.SIMPLE)
-    table.add_column("method", style="bold")
-    for heading in (
+    numbers = (
         "reconstruction\nprecision (mm)",
         "error of X\n(mm)",
         "error of X\n(deg)",
         "RMS\n(mm)",
         "iterations",
         "solve\n(ms)",
-    ):
-        table.add_column(heading, justify="right")
-    table.add_column("status")
+    )
+    table = simple_table(("method", *numbers, "status"), ("method", "status"))
     for name, record in records.items():
         error = record.get("truth_error", {})
         cells = [
