@@ -76,10 +76,6 @@ class Eliminated(Observation):
         offset, _ = self.bounds.local(q, further, images)
         return [Component(on_circle(q, offset, further, images))]
 
-    def padded(self) -> Eliminated:
-        """For images that are padded."""
-        return Eliminated(self.sigma, self.bounds.padded())
-
 
 def with_offsets(bound: Array, images: ImagePlanes) -> Observation:
     """Every offset an unknown of its own."""
@@ -234,7 +230,8 @@ def _arm(make: Callable[[Array, ImagePlanes], Observation], exact: bool) -> Call
         """As :func:`jaxcal.backend.minimise`, which always is exact near the optimum."""
         images = ImagePlanes.of(problems)
         observation, place = make(bound, images), Iterate.of(starts, RIGID)
-        images, observation = images.padded(), observation.padded()
+        images = images.padded()
+        observation = observation.padded(images)
         rounding = Rounding.of(place, observation, images)
 
         def equations(iterate: Iterate, newton: Array) -> NormalEquations:

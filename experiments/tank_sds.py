@@ -13,7 +13,6 @@ from hw.bench.tank import Beam, Noise
 from hw.midplane.search import Settings
 from jaxcal import Problem
 from jaxcal.backend import RIGID, Component, FurtherUnknowns, ImagePlanes, Observation, minimise
-from jaxcal.model.batch import pad_images
 from jaxcal.solvers.start import conventional
 
 # The engine's pieces compute in the caller's modes.
@@ -44,10 +43,6 @@ class PlacedOffsets(Observation):
             Component([jnp.sqrt(q[1] ** 2 + q[2] ** 2) - distance]),
             Component([q[1] / self.offset_sd]),
         ]
-
-    def padded(self) -> PlacedOffsets:
-        """For images that are padded."""
-        return PlacedOffsets(self.sigma, pad_images(self.offset_sd))
 
 
 @jax.jit

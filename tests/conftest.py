@@ -10,6 +10,8 @@ import subprocess
 import sys
 import tempfile
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -169,6 +171,22 @@ def select(problem: jaxcal.Problem, rows: Any) -> jaxcal.Problem:
 
     names = ("poses", "measurements", "mask", "covariance", "max_elevation")
     return replace(problem, **{name: pick(name) for name in names})
+
+
+@contextmanager
+def compiled_programs() -> Iterator[list[str]]:
+    """The list of what JAX compiles within it."""
+    compiled: list[str] = []
+
+    def listen(event: str, _: float, **__: str | int) -> None:
+        if "backend_compile" in event:
+            compiled.append(event)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        yield compiled
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
 
 
 def angle(first: np.ndarray, second: np.ndarray) -> float:

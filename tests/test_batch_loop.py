@@ -37,14 +37,16 @@ def test_the_last_problems_go_on_alone():
     begun[-1] *= 2.0**70
     widths = []
 
-    def step(state: Halving, by: Array) -> Halving:
+    def step(state: Halving, data: tuple[Array, Array]) -> Halving:
+        by, one = data
         widths.append(by.shape[0])
-        value = jnp.where(state.active, state.value * by[:, 0], state.value)
+        value = jnp.where(state.active, state.value * by[:, 0] * one, state.value)
         return Halving(value, state.passes + state.active, state.active & (value > 1))
 
     shares = np.tile(draws.choice([0.25, 0.5], (LARGE_BATCH, 1)), (1, 3))
     state = Halving(jnp.asarray(begun), jnp.zeros(LARGE_BATCH, int), jnp.ones(LARGE_BATCH, bool))
-    found = jax.jit(lambda: until_done(step, state, jnp.asarray(shares), lambda s: s.active))()
+    data = jnp.asarray(shares), jnp.ones(())  # the second is that of all problems
+    found = jax.jit(lambda: until_done(step, state, data, lambda s: s.active))()
     passes = np.maximum(1, np.ceil(-np.log(begun) / np.log(shares[:, 0])))
     np.testing.assert_array_equal(found.passes, passes)
     np.testing.assert_allclose(found.value, begun * shares[:, 0] ** passes, rtol=1e-12)

@@ -220,6 +220,17 @@ def test_what_the_pieces_cannot_take_is_said_in_a_sentence():
     images = jax.jit(backend.ImagePlanes.of)(batch)
     somewhere = Parameters.of(jnp.eye(3), jnp.zeros(3), jnp.zeros(3))
     pixels = replace(one, pixels=True, spacing_known=False)
+    place = backend.Iterate.of(jax.tree.map(lambda a: jnp.stack([a, a]), somewhere), backend.RIGID)
+
+    def made_of(found):
+        class Own(backend.Observation):
+            sigma: jax.Array
+
+            def components(self, q, further, images):
+                return found(q)
+
+        return Own
+
     for call, said in (
         (lambda: backend.initial_fit(batch), "takes one problem"),
         (lambda: backend.initial_fit(pixels), "the pixels have no spacing_mm"),
@@ -271,6 +282,31 @@ def test_what_the_pieces_cannot_take_is_said_in_a_sentence():
                 ({"tolerance": np.nan}, "tolerance must be finite and not negative"),
                 ({"max_steps": -1}, "max_steps must be between 1 and"),
                 ({"trace": -1}, "trace must be between 0 and"),
+            )
+        ),
+        (
+            lambda: backend.minimise(
+                jax.tree.map(lambda a: a.astype(jnp.float32), place),
+                backend.Points(jnp.ones((3, 2))),
+                images,
+            ),
+            "start is of float32, the images are of float64",
+        ),
+        *(
+            (
+                lambda found=found, sigma=sigma: backend.accumulate(
+                    place, made_of(found)(jnp.ones(sigma)), images
+                ),
+                said,
+            )
+            for found, sigma, said in (
+                (lambda q: [backend.Component(q)], (3,), r"sigma must have shape \(1, 2\)"),
+                (lambda q: [backend.Component(q)], (3, 2), "returns 1 components of 2 problems"),
+                (
+                    lambda q: [backend.Component([jnp.sum(q[0], 1)])],
+                    (1, 2),
+                    r"planes of shape \(2, 12\)",
+                ),
             )
         ),
         (

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
-from conftest import experiment, problem
+from conftest import compiled_programs, experiment, problem
 from golden import corpus
 
 import jaxcal
@@ -307,6 +307,9 @@ def check_the_documentations_own_observation(names: dict) -> None:
     np.testing.assert_allclose(2 * peer.cost, fit.cost[0], rtol=1e-9)
     np.testing.assert_allclose(peer.x, 0, atol=1e-5)
     images = names["images"]
+    with compiled_programs() as compiled:  # the second call of the same kind
+        backend.minimise(names["begin"], names["relative"], images)
+    assert compiled == []
     step = jnp.zeros_like(images.lateral).at[0, 3].set(1e-4)
 
     @jax.jit

@@ -35,6 +35,7 @@ from jaxcal.model.observations import (
 )
 from jaxcal.model.parameters import Parameters
 from jaxcal.model.unknowns import FURTHER, RIGID
+from jaxcal.runtime.arrays import each_image
 from jaxcal.solvers.levenberg_marquardt import (
     Descent,
     Rounding,
@@ -324,7 +325,7 @@ def test_components_apart_come_to_the_whole(drawn, name):
         assert_close(sums.gradient[0], first.gradient, 1e-12)
 
 
-@pytest.mark.parametrize("name", ["points", "bounded offsets", "channels"])
+@pytest.mark.parametrize("name", ["points", "own covariances", "bounded offsets", "channels"])
 def test_images_left_out_and_padding_count_for_nothing(drawn, name):
     place, observation, images, medium = case(drawn, name)
     keep = np.delete(np.arange(IMAGES), LEFT_OUT)
@@ -344,15 +345,13 @@ def test_images_left_out_and_padding_count_for_nothing(drawn, name):
         ),
         channels=name == "channels",
     )
-    without = observation
-    if name == "bounded offsets":
-        without = BoundedOffsets.of(observation.bound[:, keep], few)
+    without = each_image(observation, lambda values, axis: jnp.take(values, keep, axis))
     # Padding is whole vectors of 64 bytes; none for times of flight.
     padded = images.padded()
     assert padded.mask.shape[1] == (IMAGES if name == "channels" else 16)
     whole = sums_of(place, observation, images, GATE, medium)
-    fewer = sums_of(place, without.padded(), few.padded(), GATE, medium)
-    more = sums_of(place, observation.padded(), padded, GATE, medium)
+    fewer = sums_of(place, without.padded(few.padded()), few.padded(), GATE, medium)
+    more = sums_of(place, observation.padded(padded), padded, GATE, medium)
     for leaf, other, third in zip(*map(jax.tree.leaves, (whole, fewer, more)), strict=True):
         assert np.isfinite(leaf).all()
         np.testing.assert_allclose(leaf, other, rtol=1e-11, atol=1e-11 * np.abs(leaf).max())

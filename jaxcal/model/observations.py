@@ -38,7 +38,7 @@ from jaxtyping import Array, Bool, Float
 from jaxcal import InputError
 from jaxcal.data.problem import Problem
 from jaxcal.model.arc import arc_limit
-from jaxcal.model.batch import ImagePlanes, Iterate, check_batch, pad_images, targets
+from jaxcal.model.batch import ImagePlanes, Iterate, check_batch, targets
 from jaxcal.model.unknowns import (
     FURTHER,
     TABLE,
@@ -53,7 +53,7 @@ from jaxcal.model.unknowns import (
 )
 from jaxcal.model.unrolled import Matrix, Vector, add, inverse_root, root
 from jaxcal.runtime.array_types import AnyArray
-from jaxcal.runtime.arrays import is_traced
+from jaxcal.runtime.arrays import each_image, is_traced
 from jaxcal.runtime.given_values import real_array
 
 TRACKER_STEPS = 4
@@ -120,6 +120,10 @@ class Component(eqx.Module):
 class Observation(eqx.Module):
     """What every observation provides.
 
+    Solvers add images that do not count, up to whole vectors of 64 bytes. So an array of an
+    observation that has an axis of images names it ``n`` in its annotation, for example
+    ``Float[Array, "batch n"]`` of jaxtyping.
+
     Attributes:
         sigma: SD of each component, mm; ones where residuals are not in SDs.
 
@@ -176,9 +180,17 @@ class Observation(eqx.Module):
         del images, blocks
         return self
 
-    def padded(self) -> Observation:
-        """The same for images padded by :meth:`ImagePlanes.padded`."""
-        return self
+    def padded(self, images: ImagePlanes) -> Observation:
+        """The same for images that :meth:`ImagePlanes.padded` has added some to."""
+        count = images.mask.shape[1]
+
+        def longer(values: Array, axis: int) -> Array:
+            # Those added repeat the last one, in its range as in all that belongs to it.
+            added = [(0, 0)] * values.ndim
+            added[axis] = (0, count - values.shape[axis])
+            return jnp.pad(values, added, mode="edge")
+
+        return each_image(self, longer)
 
     def in_units(self, sigma: Float[Array, "components batch"]) -> Observation:
         """The same, with residuals formed with these SDs where they depend on the ratio of SDs."""
@@ -309,9 +321,6 @@ class OwnCovariances(Observation):
     def geometry(self, images: ImagePlanes, blocks: Blocks) -> Observation:
         return InPlane.of(images)
 
-    def padded(self) -> OwnCovariances:
-        return eqx.tree_at(lambda o: o.shape, self, pad_images(self.shape))
-
 
 def variance_planes(covariance: Float[Array, "batch n 2 2"]) -> Float[Array, "3 batch n"]:
     """Lateral variance, covariance and range variance as planes."""
@@ -437,10 +446,6 @@ class HeldOffsets(Observation):
     ) -> list[Component]:
         return [Component(on_circle(q, self.offset, further, images))]
 
-    def padded(self) -> HeldOffsets:
-        # A padded image's range is that of the last one, and so is its offset.
-        return eqx.tree_at(lambda o: o.offset, self, pad_images(self.offset))
-
 
 class LocalUnknown(Observation):
     """An observation with one more unknown in every image, which is eliminated there."""
@@ -527,9 +532,6 @@ class BoundedOffsets(LocalUnknown):
     ) -> list[Component]:
         return [Component(on_circle(q, local, further, images))]
 
-    def padded(self) -> BoundedOffsets:
-        return eqx.tree_at(lambda o: o.bound, self, pad_images(self.bound))
-
 
 class TrackedPoints(LocalUnknown):
     """Points whose tracker has isotropic errors of SD tau beside those of the measurements.
@@ -601,11 +603,6 @@ class TrackedPoints(LocalUnknown):
             force, bend = jax.jvp(slope, (local,), (jnp.ones_like(local),))
             local = local - force / jnp.maximum(bend, 1.0)
         return local, jnp.ones_like(local)
-
-    def padded(self) -> TrackedPoints:
-        if self.shape is None:
-            return self
-        return eqx.tree_at(lambda o: o.shape, self, pad_images(self.shape))
 
 
 class MediumPrior(eqx.Module):

@@ -41,7 +41,8 @@ def until_done(
             are not active as they are.
         state: before the first pass. Its leaves have the batch axis last.
         data: what stays the same. The batch is the first axis of a leaf that is as long as the
-            batch; of a large batch no other axis of that size may come before it.
+            batch; of a large batch no other axis of that size may come before it. A leaf without
+            such an axis is the same for all problems.
         active: which problems are not finished.
         together: whether a large batch stays whole, too.
     """
@@ -61,6 +62,8 @@ def until_done(
         return jnp.take(leaf, rows, axis, mode="clip")
 
     some = jax.tree.map(lambda leaf: of_few(leaf, -1), state)
-    theirs = jax.tree.map(lambda leaf: of_few(leaf, leaf.shape.index(batch)), data)
+    theirs = jax.tree.map(
+        lambda leaf: of_few(leaf, leaf.shape.index(batch)) if batch in leaf.shape else leaf, data
+    )
     some = jax.lax.while_loop(more_than(0), lambda state: step(state, theirs), some)
     return jax.tree.map(lambda all, of: all.at[..., rows].set(of, mode="drop"), state, some)

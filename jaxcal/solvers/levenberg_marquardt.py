@@ -40,6 +40,7 @@ from jaxcal.model.batch import ImagePlanes, Iterate, barrier, choose
 from jaxcal.model.observations import LocalUnknown, MediumPrior, Observation
 from jaxcal.runtime.arrays import is_traced
 from jaxcal.runtime.given_values import whole_number
+from jaxcal.runtime.jax_modes import inside_transformation, is_float64_on
 from jaxcal.solvers import dense
 from jaxcal.solvers.batch_loop import until_done
 from jaxcal.solvers.normal_equations import NormalEquations, accumulate
@@ -396,7 +397,8 @@ def minimise(
         Where it stopped, for every problem.
 
     Raises:
-        InputError: a start or SDs of another number of problems than the data; a ``tolerance`` or
+        InputError: a start or SDs of another number of problems than the data, or a start of
+            another dtype; arrays of 64 bits while these are switched off; a ``tolerance`` or
             ``damping`` below zero or no number; ``max_steps`` or ``trace`` that is no whole number.
     """
     check_size("damping", damping, 0.0, unit="")
@@ -405,16 +407,40 @@ def minimise(
     if not is_traced(max_steps):
         whole_number("max_steps", max_steps, 1, MOST_STEPS)
     whole_number("trace", trace, 0, MOST_STEPS)
-    batch = images.batch_size
+    batch, dtype = images.batch_size, images.mask.dtype
     for name, array in (("start", start.point), ("sigma", observation.sigma)):
         if array.ndim != 2 or array.shape[1] != batch:
             raise InputError(
                 f"{name} must be of {batch} problems (the last axis), as the images are; its shape "
                 f"is {array.shape}"
             )
+    if start.point.dtype != dtype or (dtype == jnp.float64 and not is_float64_on()):
+        raise InputError(
+            f"start is of {start.point.dtype}, the images are of {dtype}: make all arrays, and "
+            "call this, with 64 bits switched on"
+        )
     if tolerance is None:
         tolerance = default_tolerance(images.mask.dtype)
-    images, observation = barrier((images.padded(), observation.padded()))
+    data = (start, observation, images, medium)
+    # Step by step, JAX would compile the loop in every call.
+    run = _minimised if inside_transformation(data, max_steps) else _compiled
+    return run(*data, damping, tolerance, max_steps, trace, together)
+
+
+def _minimised(
+    start: Iterate,
+    observation: Observation,
+    images: ImagePlanes,
+    medium: MediumPrior | None,
+    damping: float,
+    tolerance: float,
+    max_steps: int,
+    trace: int,
+    together: bool,
+) -> Minimum:
+    """:func:`minimise` of checked arguments."""
+    images = images.padded()
+    images, observation = barrier((images, observation.padded(images)))
     rounding = barrier(Rounding.of(start, observation, images))
     undamped = damping == 0
     # The curvature jumps where offsets reach or leave their bounds, so a good exact step says
@@ -444,6 +470,9 @@ def minimise(
     data = (observation, images, medium, rounding)
     ended = until_done(one, begun, data, lambda s: s.active, together=together)
     return Minimum(*(getattr(ended, field.name) for field in fields(Minimum)))
+
+
+_compiled = eqx.filter_jit(_minimised)
 
 
 def default_tolerance(dtype: jnp.dtype) -> float:

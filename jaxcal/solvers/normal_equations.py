@@ -31,6 +31,7 @@ from __future__ import annotations
 
 from functools import cache, reduce
 from operator import add
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -38,6 +39,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxcal import InputError
 from jaxcal.model import derivatives, unrolled
 from jaxcal.model.batch import ImagePlanes, Iterate, barrier, picked, targets, total
 from jaxcal.model.observations import (
@@ -180,7 +182,9 @@ def _derive(
     def errors(*at: Array) -> Vector:
         return [plane for component in evaluate(*at) for plane in component.errors]
 
-    components, traced = evaluate(*arguments), jax.make_jaxpr(errors)(*arguments)
+    components = evaluate(*arguments)
+    _check_components(components, observation, images)
+    traced = jax.make_jaxpr(errors)(*arguments)
     rows = derivatives.first(traced, arguments)
     bent = derivatives.second(traced, arguments) if exact else {}
     first, second, start = [], [], 0
@@ -192,6 +196,24 @@ def _derive(
         )
         start = stop
     return _Derived(unknowns, components, first, second, free)
+
+
+def _check_components(components: Any, observation: Observation, images: ImagePlanes) -> None:
+    """Raise InputError for what is not one component of planes for each of the SDs."""
+    name, sigma = type(observation).__name__, observation.sigma
+    if not all(isinstance(component, Component) for component in components):
+        raise InputError(f"{name}.components must return a list of backend.Component")
+    if sigma.shape != (wanted := (len(components), images.batch_size)):
+        raise InputError(
+            f"sigma must have shape {wanted}, since {name}.components returns {wanted[0]} "
+            f"components of {wanted[1]} problems, not {sigma.shape}"
+        )
+    for plane in (plane for component in components for plane in component.errors):
+        if plane.shape[:2] != images.mask.shape:
+            raise InputError(
+                f"errors of {name}.components must be planes of shape {images.mask.shape}, "
+                f"problems and images, not {plane.shape}"
+            )
 
 
 def over_elements(plane: Entry) -> Entry:

@@ -324,7 +324,8 @@ def self_tuned(
     fallback, count = observation.sigma, observation.count(images)
     enough = images.used >= MINIMUM_SELF_TUNING
     cosine_tolerance = default_tolerance(images.mask.dtype)
-    images, observation = barrier((images.padded(), observation.padded()))
+    images = images.padded()
+    images, observation = barrier((images, observation.padded(images)))
     # Values of a problem are computed once, and not again for every image.
     coordinates, fallback, count, enough = barrier(
         (largest_coordinate(start, images), fallback, count, enough)
