@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import experiment
+from conftest import compiled_programs, experiment
 
 import jaxcal
 from jaxcal import InputError, Protocol, simulate
@@ -42,19 +42,10 @@ def test_draws_do_not_depend_on_the_batch():
 
 def test_a_call_with_values_is_one_program_for_all_keys_and_sizes():
     """It ran step by step: 279 programs for the first call, and one more for each other call."""
-    compiled = []
-
-    def listen(event: str, _: float, **__: str | int) -> None:
-        if "backend_compile" in event:
-            compiled.append(event)
-
     first, second = jax.random.split(ROOT)
     drawn = simulate(first, SMALL)
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    try:
+    with compiled_programs() as compiled:
         other = simulate(second, replace(SMALL, noise_mm=0.0, depth_mm=(20.0, 60.0)))
-    finally:
-        jax.monitoring.unregister_event_duration_listener(listen)
     assert compiled == []
     np.testing.assert_array_equal(simulate(first, SMALL).points, drawn.points)
     assert isinstance(drawn.points, jax.Array)
@@ -95,3 +86,5 @@ def test_a_traced_size_that_makes_no_sense_is_not_passed_over_in_silence():
     for noise, lost in ((0.0, False), (-1.0, True), (np.nan, True)):
         assert np.isnan(np.asarray(poses(noise))[:, :3]).all() == lost
         assert np.isnan(np.asarray(poses(noise))).any() == lost
+    with pytest.raises(InputError, match=r"jaxcal\.simulate is for jit"):
+        jax.jit(lambda noise: jaxcal.simulate_recording(replace(SMALL, noise_mm=noise)))(0.5)

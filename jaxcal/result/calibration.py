@@ -23,7 +23,9 @@ from jaxcal.runtime.arrays import (
     array_module,
     array_tree,
     has_values,
+    is_on_one_processor,
     is_traced,
+    like,
     map_arrays,
     outline,
     static,
@@ -166,11 +168,14 @@ class OneOrBatch:
         # Numpy raises an error for an index outside the batch; JAX would clip it.
         np.empty(self.mask.shape[:-1])[given]
 
-        def taken(leaf: AnyArray) -> AnyArray:
+        def taken(leaf: Any) -> AnyArray:
+            near = isinstance(leaf, np.ndarray) or is_on_one_processor(leaf)
+            # JAX would compile a program for every shape of a batch, and keep it.
+            whole = np.asarray(leaf) if near else leaf
             # With all the other axes named, an ellipsis in the index stands for the batch's only.
-            part = leaf[(*given, *(slice(None),) * (leaf.ndim - axes))]
+            part = whole[(*given, *(slice(None),) * (leaf.ndim - axes))]
             # An element of a numpy array is a scalar, not an array.
-            return np.asarray(part) if isinstance(leaf, np.ndarray) else part
+            return like(leaf, part) if near else part
 
         return map_arrays(taken, self)
 

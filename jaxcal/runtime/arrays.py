@@ -76,13 +76,24 @@ def array_module(*values: object) -> Any:
     return jax_in_use().numpy if is_traced(*values) else np
 
 
-def like(before: Any, values: np.ndarray) -> Any:
-    """Values as a numpy or JAX array of the dtype of another array, like that one."""
+def like(before: Any, values: Any) -> Any:
+    """Values as a numpy or JAX array of the dtype of another array, where that one is."""
+    values = np.asarray(values, before.dtype)
     if isinstance(before, np.ndarray):
-        return values.astype(before.dtype)
-    from jax import numpy as jnp
+        return values
+    import jax
 
-    return jnp.asarray(values, before.dtype)
+    place = before.sharding if before.committed and len(before.devices()) == 1 else None
+    with jax.enable_x64(True):  # the caller may have made it in 64 bits, and left them
+        return jax.device_put(values, place)
+
+
+def is_on_one_processor(leaf: Any) -> bool:
+    """Whether this is a JAX array whose values numpy reads where they are."""
+    jax = jax_in_use()
+    if jax is None or not isinstance(leaf, jax.Array) or is_traced(leaf):
+        return False
+    return [device.platform for device in leaf.devices()] == ["cpu"]
 
 
 def static(*, default: Any = dataclasses.MISSING) -> Any:

@@ -20,7 +20,7 @@ def real_array(value: Any, name: str) -> np.ndarray:
 
     Raises:
         InputError: what numpy would convert with a loss (complex numbers, masked entries), with a
-            guess (texts, truth values) or not at all.
+            guess (texts, truth values) or not at all; a traced array, which has no numbers.
     """
     refuse_masked(value, name)
     try:
@@ -31,6 +31,8 @@ def real_array(value: Any, name: str) -> np.ndarray:
             return np.array(given, np.float64)
     except (TypeError, ValueError, OverflowError):
         pass
+    if is_traced(value):
+        raise InputError(f"{name} has no values inside a jit, vmap or grad: call this outside")
     raise InputError(f"{name} must be an array of real numbers")
 
 

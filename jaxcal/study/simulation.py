@@ -522,6 +522,8 @@ def simulate_recording(
         InputError: a seed that is no whole number from 0 to 2^63 - 1, or a clock without times.
     """
     check_made("protocol", protocol, Protocol, "jaxcal.Protocol")
+    if is_traced(vars(protocol)):
+        raise InputError("a recording has no traced numbers: jaxcal.simulate is for jit and vmap")
     seed = whole_number("seed", seed, 0, LARGEST_SEED)
     curved = isinstance(protocol.probe, CurvilinearProbe)
     if clock_hz is not None and not (protocol.raw or curved):
