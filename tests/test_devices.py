@@ -34,6 +34,16 @@ sharding = NamedSharding(Mesh(np.array([first, second]), "k"), PartitionSpec("k"
 spread = jaxcal.calibrate_batch(jax.device_put(problems, sharding), "conventional", chunk=3)
 assert spread.rms.devices() == {first, second}
 np.testing.assert_allclose(spread.image_to_probe, free.image_to_probe, atol=1e-9)
+mesh = jax.make_mesh((2,), ("k",))
+assert mesh.explicit_axes
+explicit = jax.device_put(problems, NamedSharding(mesh, PartitionSpec("k")))
+spread = jaxcal.calibrate_batch(explicit, "conventional", chunk=3)
+np.testing.assert_allclose(spread[5].image_to_probe, free.image_to_probe[5], atol=1e-9)
+with jax.set_mesh(mesh):
+    try:
+        jaxcal.calibrate_batch(explicit, "conventional")
+    except jaxcal.InputError as error:
+        print(error)
 torn = jax.device_put(problems, second)
 torn = dataclasses.replace(torn, poses=jax.device_put(problems.poses, first))
 try:
@@ -55,6 +65,7 @@ def test_results_do_not_depend_on_the_devices_and_stay_there(tmp_path):
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "different devices" in done.stdout
+    assert "AxisType.Auto" in done.stdout
     each = [jaxcal.Problem.from_arrays(given["poses"], points) for points in given["points"]]
     one = jaxcal.calibrate_batch(each, method="conventional")
     assert len(one.rms.devices()) == 1

@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh, NamedSharding
 
 from jaxcal import InputError
 from jaxcal.data.problem import Problem, lengthened
@@ -102,10 +103,12 @@ def solve_batch(problems: Problem, given: Given, plan: SolvePlan, chunk: int | N
     """
     executables.refuse_after_fork()
     shape = problems.batch_shape
+    inside = inside_transformation(problems, given)
+    if not inside:
+        problems = _with_automatic_axes(problems)
     flat = problems
     if len(shape) > 1:
         flat = map_arrays(lambda leaf: leaf.reshape((-1, *leaf.shape[len(shape) :])), problems)
-    inside = inside_transformation(problems, given)
     largest = chunk or _side_by_side(problems, plan, inside=inside)
     count = flat.mask.shape[0]
     kept = count > 0 and _is_kept(problems, plan, inside=inside)
@@ -118,6 +121,32 @@ def solve_batch(problems: Problem, given: Given, plan: SolvePlan, chunk: int | N
     result = map_arrays(lambda leaf: leaf[:count].reshape((*shape, *leaf.shape[1:])), result)
     # Moved after it is cut: a slice of a numpy array is a view, one of a JAX array a copy.
     return replace(as_jax_holds(result, problems) if kept else result, problem=problems)
+
+
+def _with_automatic_axes(problems: Problem) -> Problem:
+    """The problems divided as they are, by a mesh that leaves it to JAX how results are divided.
+
+    The axes of ``jax.make_mesh`` are explicit: each operation would have to say it of its result.
+    """
+
+    def is_explicit(leaf: Any) -> bool:
+        sharding = getattr(leaf, "sharding", None)
+        return isinstance(sharding, NamedSharding) and bool(sharding.mesh.explicit_axes)
+
+    def automatic(leaf: Any) -> Any:
+        if not is_explicit(leaf):
+            return leaf
+        mesh = Mesh(leaf.sharding.mesh.devices, leaf.sharding.mesh.axis_names)
+        return jax.device_put(leaf, NamedSharding(mesh, leaf.sharding.spec))
+
+    if not any(map(is_explicit, jax.tree.leaves(problems))):
+        return problems
+    if jax.sharding.get_abstract_mesh().explicit_axes:
+        raise InputError(
+            "jax.set_mesh makes the axes of a mesh explicit: call jaxcal.calibrate_batch outside "
+            "of it, or make the mesh with axis_types=(jax.sharding.AxisType.Auto,)"
+        )
+    return map_arrays(automatic, problems)
 
 
 def _side_by_side(problems: Problem, plan: SolvePlan, *, inside: bool) -> int:
