@@ -158,6 +158,13 @@ def test_a_chunk_of_other_arrays_is_not_written(squares, tmp_path, change, said)
     assert not list((tmp_path / "study" / "chunks").iterdir())
 
 
+def test_a_study_that_could_not_be_resumed_is_not_begun(squares, tmp_path):
+    kind = type("Forgetful", (squares,), {"from_canonical": classmethod(lambda kind, _: kind())})
+    with pytest.raises(InputError, match="does not give back the study"):
+        run_study(kind(seed=4), tmp_path / "study")
+    assert not (tmp_path / "study").exists()
+
+
 def test_a_module_that_a_worker_cannot_import_is_told_of(tmp_path, monkeypatch, capfd):
     begin = f"import os\nif os.getpid() != {os.getpid()}: raise RuntimeError('no licence here')\n"
     (tmp_path / "loose_licensed.py").write_text(begin + MODULE)
@@ -247,7 +254,7 @@ def test_a_file_names_the_versions_that_computed_it_not_those_that_wrote_it(tmp_
     assert store.versions(chunk) == "jaxcal 9.9.9, jax 8.8.8, 4 x gpu"
 
 
-def test_chunks_of_another_version_are_told_of_when_they_are_continued(tmp_path, squares):
+def test_chunks_of_another_version_are_told_of_when_they_are_continued(tmp_path, squares, caplog):
     """Not only by the next run, which may never come."""
     study, notes = squares(), []
     store = Store(tmp_path / "study", study)
@@ -262,6 +269,8 @@ def test_chunks_of_another_version_are_told_of_when_they_are_continued(tmp_path,
             notes.append(message)
 
     assert run_study(study, store.folder, resume=True, watcher=Notes()).computed == 1
+    assert run_study(study, store.folder, resume=True).computed == 0
+    assert caplog.messages == notes  # where nobody watches
     assert len(notes) == 1
     assert "2 different set-ups: " in notes[0]
     for versions in ("jaxcal 9.9.9, jax 8.8.8, 4 x gpu", store.versions(study.chunk(2))):

@@ -199,6 +199,12 @@ def test_what_says_the_same_has_the_same_hash():
         assert parse_spec(changed).sha256 != spec.sha256
     with pytest.raises(InputError):
         Spec.from_canonical(spec.canonical().replace('"seed": 11', '"seed": 11.0'))
+    # A spec that is changed in Python is checked, and can be read back.
+    fewer = dataclasses.replace(spec, trials=3, seed=12)
+    assert Spec.from_canonical(fewer.canonical()) == fewer
+    for change in ({"seed": -1}, {"trials": 0}, {"methods": ()}, {"chunk_trials": 0}):
+        with pytest.raises(InputError):
+            dataclasses.replace(spec, **change)
 
 
 @pytest.mark.parametrize(

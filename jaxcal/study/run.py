@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import time
 from collections.abc import Generator, Iterator
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from distributed import Client
 
 _MOST_WORKERS = 10_000
+_log = logging.getLogger(__name__)
 
 
 @runtime_checkable
@@ -41,7 +43,11 @@ class Watcher(Protocol):
 
 
 class Silence(Watcher):
-    """A watcher that says nothing."""
+    """A watcher that shows no progress."""
+
+    def note(self, message: str) -> None:
+        """Into Python's log, which prints it where nobody has set it up."""
+        _log.warning(message)
 
 
 @dataclass(frozen=True)
@@ -83,7 +89,8 @@ def run_study(
         workers: processes on this machine, each on cores of its own; 0 computes in this process.
         scheduler: instead, the address of a running Dask scheduler, or a Dask cluster (whatever
             ``distributed.Client`` takes), e.g. a ``dask_jobqueue.SLURMCluster``.
-        watcher: is told about the progress.
+        watcher: is told about the progress; without one, what a person should know is logged as a
+            warning (damaged files, several versions, workers left out).
 
     Raises:
         InputError: no study, one whose class other processes cannot import, another spec's results
@@ -96,6 +103,11 @@ def run_study(
     if not isinstance(spec, Study):
         raise InputError(
             f"run_study takes a study, not {shown(spec)}: jaxcal.study.load_spec(path) reads one"
+        )
+    if type(spec).from_canonical(spec.canonical()).sha256 != spec.sha256:
+        raise InputError(
+            "the study's from_canonical does not give back the study that canonical describes: it "
+            "could not be resumed"
         )
     if whole_number("workers", workers, 0, _MOST_WORKERS) and scheduler is not None:
         raise InputError("workers must not be given together with a scheduler")

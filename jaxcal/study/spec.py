@@ -95,6 +95,7 @@ UNITS = {
 }
 """Unit of every array of a chunk."""
 
+_HEAD = ("name", "seed", "trials", "chunk_trials")
 _COUNTS = {"images": (MINIMUM_IMAGES, MOST_IMAGES), "test_images": (2, MOST_IMAGES)}
 _LARGEST = {"rotation_deg": 180.0, "test_fraction": 10.0, "tracker_deg": 57.0}
 _LARGEST_MM = 1000.0
@@ -216,6 +217,23 @@ class Spec:
     probe: LinearProbe
     methods: tuple[MethodSpec, ...]
 
+    def __post_init__(self) -> None:
+        if not (isinstance(self.name, str) and re.fullmatch(r"[A-Za-z0-9_-]{1,100}", self.name)):
+            raise InputError("name must be 1 to 100 letters, digits, - and _")
+        limits = {
+            "seed": (0, LARGEST_SEED),
+            "trials": (1, MAXIMUM_EXPERIMENTS),
+            "chunk_trials": (1, 2**20),
+        }
+        for name, (least, most) in limits.items():
+            object.__setattr__(self, name, whole_number(name, getattr(self, name), least, most))
+        object.__setattr__(self, "chunk_trials", min(self.chunk_trials, self.trials))
+        if not 1 <= len(self.methods) <= MAXIMUM_METHODS:
+            raise InputError(f"there must be 1 to {MAXIMUM_METHODS} [[methods]]")
+        if len({method.name for method in self.methods}) < len(self.methods):
+            raise InputError("two [[methods]] have the same name")
+        _check_size(self)
+
     def axis(self, name: str) -> tuple[float | int | str, ...]:
         """Values of one field of ``[conditions]``."""
         return dict(self.axes)[name]
@@ -276,18 +294,19 @@ class Spec:
                 name: values if name in content["listed"] else values[0]
                 for name, values in content["axes"].items()
             }
+            axes, listed = _axes(conditions)
             spec = cls(
-                *_head(content),
-                *_axes(conditions),
-                LinearProbe(**content["probe"]),
-                tuple(MethodSpec(**method) for method in content["methods"]),
+                **{name: content[name] for name in _HEAD},
+                axes=axes,
+                listed=listed,
+                probe=LinearProbe(**content["probe"]),
+                methods=tuple(MethodSpec(**method) for method in content["methods"]),
             )
             same = spec.canonical() == text
         except (ValueError, LookupError, TypeError, AttributeError, OverflowError) as error:
             raise InputError(f"is not a study's canonical spec: {error}") from None
         if not same:
             raise InputError("is not a study's canonical spec")
-        _check_size(spec)
         return spec
 
     def arrays(self, chunk: Chunk) -> dict[str, ArraySpec]:
@@ -336,24 +355,12 @@ def parse_spec(text: str) -> Spec:
 
 
 def _spec(content: dict[str, Any]) -> Spec:
-    _known(content, {"name", "seed", "trials", "chunk_trials", "conditions", "probe", "methods"})
-    head = _head(content)
+    _known(content, {*_HEAD, "conditions", "probe", "methods"})
+    content = {"chunk_trials": 512, **content}
+    head = {name: _required(content, name) for name in _HEAD}
     axes, listed = _axes(_table(content, "conditions"))
     probe = _probe(_table(content, "probe"))
-    spec = Spec(*head, axes, listed, probe, _methods(content))
-    _check_size(spec)
-    return spec
-
-
-def _head(content: dict[str, Any]) -> tuple[str, int, int, int]:
-    """Name, seed, trials of a condition, and trials of a chunk."""
-    name = _required(content, "name")
-    if not (isinstance(name, str) and re.fullmatch(r"[A-Za-z0-9_-]{1,100}", name)):
-        raise InputError("name must be 1 to 100 letters, digits, - and _")
-    seed = whole_number("seed", _required(content, "seed"), 0, LARGEST_SEED)
-    trials = whole_number("trials", _required(content, "trials"), 1, MAXIMUM_EXPERIMENTS)
-    chunk = whole_number("chunk_trials", content.get("chunk_trials", 512), 1, 2**20)
-    return name, seed, trials, min(chunk, trials)
+    return Spec(**head, axes=axes, listed=listed, probe=probe, methods=_methods(content))
 
 
 def _known(table: dict[str, Any], names: set[str], where: str = "") -> None:
@@ -449,13 +456,7 @@ def _methods(content: dict[str, Any]) -> tuple[MethodSpec, ...]:
     tables = _required(content, "methods")
     if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
         raise InputError("methods must be tables: [[methods]]")
-    if not 1 <= len(tables) <= MAXIMUM_METHODS:
-        raise InputError(f"there must be 1 to {MAXIMUM_METHODS} [[methods]]")
-    methods = tuple(_method(table, f"methods[{k}]") for k, table in enumerate(tables))
-    names = [method.name for method in methods]
-    if len(set(names)) < len(names):
-        raise InputError("two [[methods]] have the same name")
-    return methods
+    return tuple(_method(table, f"methods[{k}]") for k, table in enumerate(tables))
 
 
 def _method(table: dict[str, Any], place: str) -> MethodSpec:
