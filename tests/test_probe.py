@@ -109,13 +109,13 @@ def test_sound_speed_of_many_temperatures_and_of_kelvin():
     ("values", "said"),
     [
         ({"elements": 1}, "2 to 65536 elements"),
-        ({"pitch_mm": 0.0}, "pitch must be in mm"),
-        ({"pitch_mm": float("nan")}, "pitch must be in mm"),
+        ({"pitch_mm": 0.0}, "pitch_mm must be in mm"),
+        ({"pitch_mm": float("nan")}, "pitch_mm must be in mm"),
         ({"sound_speed_m_s": 1.49}, "m/s .*1.49 looks like mm/us"),
         ({"sound_speed_m_s": 1.49e6}, "must be in m/s"),
         ({"sound_speed_m_s": float("nan")}, "must be in m/s"),
-        ({"delay_s": 0.5}, "delay must be in s"),
-        ({"delay_s": float("inf")}, "delay must be in s"),
+        ({"delay_s": 0.5}, "delay_s must be in s"),
+        ({"delay_s": float("inf")}, "delay_s must be in s"),
     ],
 )
 def test_impossible_probes_are_refused(kind, values, said):

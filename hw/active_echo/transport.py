@@ -10,6 +10,7 @@ import contextlib
 import errno
 import threading
 from typing import Any
+from urllib.parse import urlsplit
 
 from hw.runtime.errors import Device, DeviceError, LostError, StaleError
 from hw.runtime.extras import require
@@ -104,9 +105,12 @@ def open_transport(url: str, *, baud: int = BAUD) -> Transport:
     options: dict[str, Any] = {"timeout": _POLL_S, "write_timeout": _WRITE_TIMEOUT_S}
     if "://" not in url:
         options |= {"baudrate": baud, "exclusive": True}
+    if url.startswith("socket://") and not _has_port(url):
+        raise DeviceError(f"cannot open {url}: write it as socket://host:port", device=DEVICE)
     try:
         port = serial.serial_for_url(url, **options)
-    except (OSError, ValueError) as error:
+    # pyserial has KeyError and others for URLs that it does not understand.
+    except Exception as error:
         text = _first_line(error)
         if getattr(error, "errno", None) == errno.ENOENT:
             found = require("serial.tools.list_ports", extra="serial").comports()
@@ -116,6 +120,14 @@ def open_transport(url: str, *, baud: int = BAUD) -> Transport:
             text = "another program uses it"
         raise DeviceError(f"cannot open {url}: {text}", device=DEVICE) from None
     return Transport(port, url)
+
+
+def _has_port(url: str) -> bool:
+    try:
+        parts = urlsplit(url)
+        return bool(parts.hostname and parts.port)
+    except ValueError:
+        return False
 
 
 def _first_line(error: Exception) -> str:

@@ -182,7 +182,8 @@ class PosedImages:
         if both:
             return
         missing = "images" if not self._waiting else "transforms"
-        reason = counts.reason
+        only_rf = not self._waiting and counts.received > 0
+        reason = "RF channel data are not" if only_rf else counts.reason
         if not self._waiting and counts.other_devices:
             raise DeviceError(
                 f"{self._stream.address} sends no images of the device that was named, "

@@ -28,6 +28,31 @@ _ANSWERING_LINES = 4
 _LISTEN_AGAIN = 3
 _DEVICE: Device = "active echo"
 
+MOST_FRAMES = 256
+"""Most active-echo frames that are listened to at once."""
+_LONGEST_MM = 50.0
+"""Of every length in :class:`Settings`; [limits] allow no wider search."""
+_MOST = {
+    "low_threshold": 4095,
+    "frames": MOST_FRAMES,
+    "top_fraction": 0.99,
+    "most_moves": 10_000,
+    "most_travel_mm": 10_000.0,
+    "full_scale": 65_535.0,
+    "factor": 10.0,
+}
+"""Of the others."""
+_POSITIVE = (
+    "coarse_mm",
+    "fine_mm",
+    "finest_mm",
+    "frames",
+    "epsilon_mm",
+    "top_fraction",
+    "most_moves",
+    "full_scale",
+    "factor",
+)
 
 OnStop = Callable[[float, float, int], None]
 """Told of a stop: offset (mm), amplitude (counts), threshold."""
@@ -147,14 +172,11 @@ class Settings:
 
     def __post_init__(self) -> None:
         for name in self.__dataclass_fields__:
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value >= 0):
-                raise InputError(f"search: {name} must be a number that is not negative: {value}")
-        for name in ("coarse_mm", "fine_mm", "finest_mm", "frames", "epsilon_mm", "factor"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"search: {name} must be positive")
-        if not 0 < self.top_fraction < 1:
-            raise InputError("search: top_fraction must be between 0 and 1")
+            value, most = getattr(self, name), _MOST.get(name, _LONGEST_MM)
+            positive = name in _POSITIVE
+            if not ((value > 0 if positive else value >= 0) and value <= most):
+                bounds = f"above 0 and at most {most:g}" if positive else f"0 to {most:g}"
+                raise InputError(f"{name} must be {bounds}, not {value}")
 
     def bracket(self, centre_mm: float, half_mm: float, sd_mm: float) -> Bracket:
         """A bracket from what a search found and the independent errors that it cannot see.

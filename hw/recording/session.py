@@ -22,6 +22,7 @@ from itertools import pairwise
 import numpy as np
 
 from hw.active_echo.device import SILENT, ActiveEcho, EchoFrame, EchoStatistics, median_of
+from hw.midplane.search import MOST_FRAMES
 from hw.recording.recorder import Recorder
 from hw.robot.limits import between
 from hw.robot.stream import PoseSample, PoseStream
@@ -127,7 +128,7 @@ class Session:
         self.watch = SilenceLimits() if watch is None else watch
         self._recorder, self._every_frame = recorder, every_frame
         self._lock, self._changed = lock_and_condition()
-        self._echo_frames: deque[EchoFrame] = deque(maxlen=_KEPT_FRAMES)
+        self._echo_frames: deque[EchoFrame] = deque(maxlen=MOST_FRAMES)
         self._image: Image | None = None
         self._first_seen: dict[int, float] = {}
         """When each of the newest different images came first, by the CRC-32 of its pixels."""
@@ -316,7 +317,7 @@ class Session:
         """Whole echo frames that began after a moment.
 
         Args:
-            frames: how many.
+            frames: how many, at most :data:`~hw.midplane.search.MOST_FRAMES`.
             since: bench time. A frame is assumed to have begun before its arrival by its delay, or
                 by the stream's period (:func:`frame_period`) if that is longer; a frame whose delay
                 is not known is not taken.

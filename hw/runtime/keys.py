@@ -107,8 +107,11 @@ class Keyboard:
     def __exit__(self, *_: object) -> None:
         self._ending = True
         if self._thread is not None and self._terminal is not None:
-            self._thread.join()
-            self._terminal.lines()
+            try:
+                self._thread.join()
+            finally:
+                # Also where Ctrl-C, held down, ends the wait.
+                self._terminal.lines()
         self._pause.go_on()
 
     @contextmanager
@@ -191,10 +194,14 @@ class _Terminal:
 
     def typed(self) -> bytes | None:
         """What was typed within a short time; None when the terminal is gone."""
+        termios = _termios()
         try:
             if not _is_foreground(self._number):
                 time.sleep(_PERIOD_S)
                 return b""
+            if termios.tcgetattr(self._number)[3] & termios.ICANON:
+                # After Ctrl-Z and fg the terminal reads by lines, as the shell left it.
+                self.keys()
             if not self._waiting():
                 return b""
             typed = os.read(self._number, 256)
@@ -202,7 +209,7 @@ class _Terminal:
             if typed.endswith(b"\x1b") and self._waiting():
                 typed += os.read(self._number, 256)
             return typed or None
-        except OSError:
+        except (OSError, termios.error):
             return None
 
     def _ours(self) -> bool:

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
-from hw.midplane.search import Settings
+from hw.active_echo.codec import MAXIMUM_LINES
+from hw.midplane.search import MOST_FRAMES, Settings
 from hw.planning.poses import Extent
 from hw.planning.scene import Scene
 from hw.robot.kinematics import model_named
@@ -45,6 +46,7 @@ _LONGEST_SETTLE_S = 30.0
 _MOST_POSES_HZ = 1000.0
 """Twice as many as a controller sends."""
 _TIP_TOLERANCE_MM = 0.1
+_Made = TypeVar("_Made")
 
 
 @dataclass(frozen=True)
@@ -117,8 +119,9 @@ class Setup:
             )
         housing = self.housing_mm or (self.probe.width_mm, *_HOUSING_MM)
         hull = hull_of(self.scene.image_to_probe, *housing)
+        arm = {"arm_model": model} if model else {}
         return Limits.from_mapping(
-            {"hull_mm": hull, **self.limits, "tip_mm": tip.tolist(), "arm_model": model}
+            {"hull_mm": hull, **self.limits, "tip_mm": tip.tolist(), **arm}
         )
 
 
@@ -157,13 +160,13 @@ def load_hand_held(path: str | os.PathLike[str]) -> HandHeldSetup:
         found = _checked(tables, names, active_echo=("url",), scene=("image_to_probe",))
         found["probe"].pop("housing_mm", None)
         drawn = _drawn(found["scene"]["image_to_probe"])
-        probe = LinearProbe(**found["probe"])
+        probe = _made("probe", LinearProbe, found["probe"])
         _check_width(probe)
         return HandHeldSetup(
             found["active_echo"]["url"],
             check_poses(drawn[None])[0],
             probe,
-            Settings(**found["search"]),
+            _made("search", Settings, found["search"]),
             os.fspath(path),
         )
 
@@ -216,7 +219,7 @@ def _reach_mm(given: bool, search: Settings, limits: Limits) -> float:
     if allowed <= search.backlash_mm:
         raise InputError(
             f"[limits] search_mm of {allowed:g} leaves no room for the search, which comes to "
-            f"every place from {search.backlash_mm:g} mm below"
+            f"every place from [search] backlash_mm = {search.backlash_mm:g} below"
         )
     return min(search.reach_mm, allowed)
 
@@ -269,8 +272,8 @@ def _setup(tables: dict[str, Any]) -> Setup:
             raise InputError(f"[probe] housing_mm must be 1 to {FURTHEST_TIP_MM:g} mm each")
     echo = found["active_echo"]
     frames = echo.get("frames", Setup.frames)
-    if not 1 <= frames <= 1000:
-        raise InputError("[active_echo] frames must be 1 to 1000")
+    if not 1 <= frames <= MOST_FRAMES:
+        raise InputError(f"[active_echo] frames must be 1 to {MOST_FRAMES}")
     plan = {
         key: _as_tuple(_numbers(key, value, _PLAN_SHAPES[key], "plan").tolist())
         if key in _PLAN_SHAPES
@@ -287,9 +290,9 @@ def _setup(tables: dict[str, Any]) -> Setup:
             _numbers("looking", scene["looking"], (3,)),
         ),
         limits=found["limits"],
-        probe=LinearProbe(**found["probe"]),
-        extent=Extent(**plan),
-        search=Settings(**found["search"]),
+        probe=_made("probe", LinearProbe, found["probe"]),
+        extent=_made("plan", Extent, plan),
+        search=_made("search", Settings, found["search"]),
         housing_mm=housing,
         **robot,
     )
@@ -361,6 +364,11 @@ def _check_lengths(setup: Setup, tip_at_tcp: bool) -> None:
 
 
 def _check_width(probe: LinearProbe) -> None:
+    if probe.elements > MAXIMUM_LINES:
+        raise InputError(
+            f"[probe] elements must be at most {MAXIMUM_LINES}, the most lines of an active-echo "
+            f"frame, not {probe.elements}"
+        )
     width = probe.width_mm
     if not _WIDTH_MM[0] <= width <= _WIDTH_MM[1]:
         raise InputError(
@@ -389,6 +397,14 @@ def _checked(
             if key not in found[name]:
                 raise InputError(f"[{name}] needs {key}")
     return found
+
+
+def _made(table: str, kind: Callable[..., _Made], values: dict[str, Any]) -> _Made:
+    """What a table describes; where it cannot be, its name stands before the error."""
+    try:
+        return kind(**values)
+    except InputError as error:
+        raise InputError(f"[{table}] {error}") from None
 
 
 def _table(tables: dict[str, Any], name: str) -> dict[str, Any]:

@@ -91,9 +91,11 @@ def refuse_strangers() -> None:
 
 def _is_own(headers: Any) -> bool:
     """Whether a request names this machine, and no page of another site has made it."""
-    names = [f"//{host}" for host in headers.get_all("Host")] + headers.get_all("Origin")
+    hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
     try:
-        return all(urlsplit(name).hostname in _OWN_NAMES for name in names)
+        own = all(urlsplit(f"//{host}").hostname in _OWN_NAMES for host in hosts)
+        # Another port of this machine may belong to another program's page.
+        return own and all(urlsplit(origin).netloc in hosts for origin in origins)
     except ValueError:
         return False
 

@@ -45,12 +45,10 @@ class _Array:
             raise InputError(f"a probe needs 2 to {MOST_ELEMENTS} elements, not {self.elements}")
         object.__setattr__(self, "elements", int(self.elements))
         if not (np.isfinite(self.pitch_mm) and 0 < self.pitch_mm < 100):
-            raise InputError(f"probe pitch must be in mm between 0 and 100, not {self.pitch_mm}")
+            raise InputError(f"pitch_mm must be in mm between 0 and 100, not {self.pitch_mm}")
         check_sound_speed(self.sound_speed_m_s)
         if not abs(self.delay_s) < _LONGEST_DELAY_S:
-            raise InputError(
-                f"probe delay must be in s, less than a millisecond, not {self.delay_s}"
-            )
+            raise InputError(f"delay_s must be in s, less than 1 ms, not {self.delay_s}")
 
     @property
     def width_mm(self) -> float:

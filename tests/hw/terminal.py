@@ -80,6 +80,18 @@ class Terminal:
             pass
         return self._process.wait(timeout_s)
 
+    def hold_ctrl_c(self) -> None:
+        """Press Ctrl-C again and again until the command ends."""
+        while self._process.poll() is None:
+            self.type("\x03")
+            deadline = time.monotonic() + 0.2
+            while self._more(deadline):
+                pass
+
+    def set_modes(self, modes: list) -> None:
+        """Set the terminal as another program would."""
+        termios.tcsetattr(self._terminal, termios.TCSANOW, modes)
+
     def modes(self) -> list:
         """Of the terminal, as ``termios`` has them."""
         return termios.tcgetattr(self._terminal)

@@ -181,6 +181,13 @@ def test_a_second_program_is_refused() -> None:
         ActiveEcho(emulator.path)
     with pytest.raises(DeviceError, match=r"no-such-port: there is no such port, .* are (/|no)"):
         open_transport("/dev/no-such-port")
+    for url in ("socket://localhost", "socket://localhost:99999", "socket://:9"):
+        with pytest.raises(DeviceError, match=f"cannot open {url}: write it as socket://host:port"):
+            open_transport(url)
+    # Of these pyserial says so by a KeyError, and by an error of re.
+    for url in ("loop://?x=1", "hwgrep://["):
+        with pytest.raises(DeviceError, match="cannot open "):
+            open_transport(url)
 
 
 def test_mute_devices(pty_emulator: AuspisEmulator) -> None:

@@ -37,6 +37,8 @@ with watch_keys(pause, say, ("p",)) as keyboard:
     say("held")
     while pause.held:
         time.sleep(0.01)
+    # The thread that reads never ends now, and its end is waited for.
+    keyboard._terminal.lock.acquire()
     say("gone on")
     time.sleep(600)
 """
@@ -61,6 +63,14 @@ def test_a_terminal_by_keys_and_by_lines(tmp_path):
         person.wait_for("asking")
         person.type("k\x1b[B")
         person.wait_for("key k\\s+key down")
+        # As a shell leaves the terminal after Ctrl-Z and fg.
+        person.set_modes(person.modes_before)
+        deadline = time.monotonic() + 60.0
+        while person.modes() == person.modes_before:
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        person.type("K")
+        person.wait_for("key K")
         person.type("\r")
         person.wait_for("not asking")
         person.type("kp")
@@ -69,7 +79,7 @@ def test_a_terminal_by_keys_and_by_lines(tmp_path):
         person.wait_for(f"{paused}\r\nheld\r\n|held\r\n{paused}\r\n")
         person.type("p")
         person.wait_for("gone on")
-        person.type("\x03")
+        person.hold_ctrl_c()
         assert person.finish() != 0
         assert "KeyboardInterrupt" in person.shown
         assert person.modes() == person.modes_before

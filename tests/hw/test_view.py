@@ -250,7 +250,8 @@ def test_a_page_of_another_site_cannot_read_it(shared_view):
     protocol = [f"viser-v{viser.__version__}"]
     for host, origin, good in (
         (f"127.0.0.1:{port}", None, True),
-        (f"localhost:{port}", "http://localhost:9000", True),
+        (f"localhost:{port}", f"http://localhost:{port}", True),
+        (f"localhost:{port}", "http://localhost:9000", False),
         (f"127.0.0.1:{port}", "http://evil.example", False),
         (f"127.0.0.1:{port}", "null", False),
         ("evil.example", None, False),
