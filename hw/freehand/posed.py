@@ -44,7 +44,8 @@ _KEPT = 1024
 _ONE_CLOCK_S = 1.0
 """Images come later than the poses of their time, but not by so much (assumption)."""
 _SET_S = 0.3
-"""Neither delays nor the drift of two clocks change the time between them by so much."""
+"""Delays do not change the time between two clocks by so much; a drift of 100 ppm does in 50
+minutes, and then the poses are late by as much."""
 _SECONDS = 20.0
 """Time stamps that run so many times too fast or too slow are not in seconds."""
 
@@ -233,7 +234,10 @@ class PosedImages:
         for sample in reversed(samples):
             stamp = sample.t_host if self.by_arrival else sample.t_device
             if stamp <= moment + _SAME_S and self._was_set(name, image, sample):
-                return f"the clock of the images, or of {name}, was set: start anew"
+                return (
+                    f"the clocks of the images and of {name} no longer agree: one was set, or they "
+                    "drift; end the run and resume it"
+                )
             if abs(stamp - moment) <= _SAME_S:
                 return sample.matrix if sample.valid else f"{name} is not tracked"
             if stamp < moment:

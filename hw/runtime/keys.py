@@ -194,6 +194,8 @@ class _Terminal:
 
     def typed(self) -> bytes | None:
         """What was typed within a short time; None when the terminal is gone."""
+        import tty
+
         termios = _termios()
         try:
             if not _is_foreground(self._number):
@@ -201,7 +203,7 @@ class _Terminal:
                 return b""
             if termios.tcgetattr(self._number)[3] & termios.ICANON:
                 # After Ctrl-Z and fg the terminal reads by lines, as the shell left it.
-                self.keys()
+                tty.setcbreak(self._number, termios.TCSANOW)
             if not self._waiting():
                 return b""
             typed = os.read(self._number, 256)
