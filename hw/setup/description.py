@@ -120,9 +120,7 @@ class Setup:
         housing = self.housing_mm or (self.probe.width_mm, *_HOUSING_MM)
         hull = hull_of(self.scene.image_to_probe, *housing)
         arm = {"arm_model": model} if model else {}
-        return Limits.from_mapping(
-            {"hull_mm": hull, **self.limits, "tip_mm": tip.tolist(), **arm}
-        )
+        return Limits.from_mapping({"hull_mm": hull, **self.limits, "tip_mm": tip.tolist(), **arm})
 
 
 @dataclass(frozen=True)

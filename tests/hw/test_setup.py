@@ -113,7 +113,11 @@ def test_a_description_is_read(tmp_path):
         ("[search]", "[search]\nreach_mm = 30", r"\[search\] reach_mm is 30, but .* only 25"),
         ("search_mm = 25", "", r"\[limits\] search_mm of 0 leaves no room for the search"),
         ("fine_mm = 0.2", "fine_mm = -0.2", r"\[search\] fine_mm must be above 0 and at most 50"),
-        ("frames = 5", f"frames = 1{'0' * 90}", r"\[search\] frames must be above 0 and at most 256"),
+        (
+            "frames = 5",
+            f"frames = 1{'0' * 90}",
+            r"\[search\] frames must be above 0 and at most 256",
+        ),
         ("frames = 5", "low_threshold = 5000", r"\[search\] low_threshold must be 0 to 4095"),
         ("frames = 5", "backlash_mm = 30", r"from \[search\] backlash_mm = 30 below"),
         ('USB0"', 'USB0"\nframes = 257', r"\[active_echo\] frames must be 1 to 256"),
