@@ -239,6 +239,10 @@ def test_derivatives_are_finite_differences(name):
         everything(jax.tree.map(lambda v, d, h=h: v + h * d, data, along))[0] for h in (step, -step)
     ]
     np.testing.assert_allclose(back, (ends[0] - ends[1]) / (2 * step), rtol=1e-5)
+    # Traced numbers are not checked before: one that is no SD had the answer of its magnitude.
+    for number in given:
+        no_sd = (*data[:2], given | {number: -given[number]})
+        assert everything(no_sd)[-1][1] == jaxcal.Status.FAILED
 
 
 @pytest.mark.slow

@@ -280,8 +280,6 @@ def calibrate_batch(
         InputError: contradicting options, or problems without a leading axis.
     """
     problems = as_batch(problems, "jaxcal.calibrate_batch")
-    if not problems.batch_shape:
-        raise InputError("calibrate_batch needs problems with a leading axis; use calibrate")
     if chunk is not None:
         chunk = whole_number("chunk", chunk, 1, LARGEST_CHUNK)
     request = Request(
@@ -298,6 +296,8 @@ def calibrate_batch(
         robust=robust,
     )
     problems, plan, given = prepare(problems, request, "jaxcal.calibrate_batch")
+    if not problems.batch_shape:
+        raise InputError("calibrate_batch needs problems with a leading axis; use calibrate")
     from jaxcal.calibration.engine import solve_batch
 
     return solve_batch(problems, given, plan, chunk)

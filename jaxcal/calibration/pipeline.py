@@ -58,6 +58,11 @@ def solve_problems(
         sound &= (covariance[..., 0, 0] > 0) & (jnp.linalg.det(covariance) > 0)
     if problems.max_elevation is not None:
         sound &= problems.max_elevation >= 0
+    for sds in (given.sigma, given.prior_sd):
+        if sds is not None:
+            sound &= (sds > 0).all()
+    if given.tracker_sd is not None:
+        sound &= given.tracker_sd >= 0
     if plan.robust:
         if agreed is None:
             # One problem at a time: its finalists fill the vector units, and several problems at
@@ -68,7 +73,7 @@ def solve_problems(
             agreed = jax.vmap(jax.custom_batching.sequential_vmap(search))(seen)
         problems = replace(problems, mask=agreed)
     # Where a mask holds anything but 0 and 1, or an image has no pose, pixel size, covariance or
-    # bound that could be one, the problem fails.
+    # bound that could be one, or a given SD could be none, the problem fails.
     mask = jnp.where(sound, problems.mask, jnp.nan)
     # A mask is 0 or 1, and has no derivative; that of an image left out would be one of the
     # harmless values.
