@@ -89,6 +89,9 @@ def test_the_engine_takes_it_here_and_on_workers_and_resumes(squares, tmp_path):
         np.testing.assert_array_equal(first["square"], study.compute(chunk)["square"])
         np.testing.assert_array_equal(first["square"], second["square"])
         assert int(first["count"]) == index
+    kind = type("Flag", (squares,), {"compute": lambda *g: squares.compute(*g) | {"count": True}})
+    run_study(kind(), tmp_path / "flags")
+    assert Store(tmp_path / "flags", kind()).read(kind().chunk(0))["count"] == 1
     here.path(study.chunk(1)).unlink()
     assert run_study(study, tmp_path / "here", resume=True).computed == 1
     with pytest.raises(InputError, match="differs in its description"):

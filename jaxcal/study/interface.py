@@ -39,7 +39,7 @@ class ArraySpec:
     Attributes:
         unit: of its numbers, ``1`` for none.
         shape: all axes.
-        kind: ``f`` for floats, ``i`` for integers.
+        kind: ``f`` for floats, ``i`` for integers and truth values.
     """
 
     unit: str
@@ -170,6 +170,8 @@ def _as_wanted(name: str, values: object, wanted: ArraySpec) -> np.ndarray:
     if wanted.kind == "f" and found.dtype.kind in "iuf":
         # JAX may have been told to run in 32 bits; the file's types do not depend on it.
         found = found.astype(np.float64, copy=False)
+    elif wanted.kind == "i" and found.dtype.kind in "bu" and np.can_cast(found.dtype, np.int64):
+        found = found.astype(np.int64)
     if found.dtype.kind != wanted.kind or found.shape != wanted.shape:
         has = "is missing" if values is None else f"is {found.dtype} {found.shape}"
         raise InputError(
