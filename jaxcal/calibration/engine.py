@@ -45,7 +45,7 @@ ACCELERATOR_ROWS = 2**20
 enough for its memory."""
 
 FEW_PROBLEMS = 1024
-"""Up to so many problems of a batch are padded to a bucket of images."""
+"""Up to so many problems of a batch are padded to a bucket of images, or of problems."""
 
 
 @in_own_modes
@@ -233,6 +233,8 @@ def _solve_chunks_compiled(
     else:
         devices = devices[:1]
     size = max(-(-count // pieces), 1)
+    if alone and 0 < count <= FEW_PROBLEMS and not plan.one_by_one:
+        size = min(bucket(size), largest)  # so that one program serves several sizes
     if count and pieces * size != count:
         rows = jnp.arange(pieces * size) % count
         problems = jax.tree.map(lambda leaf: leaf[rows], problems)
