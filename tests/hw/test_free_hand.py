@@ -469,6 +469,19 @@ def test_streams_that_cannot_be_used(tmp_path, monkeypatch, separate, options, m
     assert not list(tmp_path.iterdir())
 
 
+def test_rf_alone_is_told(monkeypatch):
+    monkeypatch.setattr("hw.freehand.posed.LISTEN_S", 0.3)
+    picture = Picture(np.zeros((8, 4), np.int16), SPACING_MM)
+    with (
+        socket.create_server(("127.0.0.1", 0)) as listener,
+        UltrasoundStream(*listener.getsockname()) as stream,
+        listener.accept()[0] as connection,
+    ):
+        connection.sendall(encode(Message("IMAGE", "RF", 1.0, picture)))
+        with pytest.raises(DeviceError, match=r"that can be used \(RF channel data are not\)"):
+            PosedImages(stream)
+
+
 def test_no_server(tmp_path, capsys):
     assert main(["free-hand", "127.0.0.1:1", str(tmp_path / "r.h5")]) == 4
     error = capsys.readouterr().err
