@@ -2,7 +2,37 @@
 
 from __future__ import annotations
 
-from claims import VERDICT, claim, column, percent, span
+from claims import VERDICT, claim, column, number, percent, span, table
+
+
+# Wrong frames and units.
+def _wrong_frames() -> list[float]:
+    """How many recordings, and faults; that all but those on the page are named or refused."""
+    unseen = {
+        ("u mirrored", "mm"),
+        ("u mirrored", "px, known"),
+        ("u mirrored", "px, unknown"),
+        ("u and v swapped", "px, unknown"),
+        ("poses in cm", "px, unknown"),
+    }
+    rows = table("wrong_frames")
+    (recordings,) = {number(row, "recordings") for row in rows}
+    for row in rows:
+        told = number(row, "named") + number(row, "refused")
+        right = row["slip"] == "none" or (row["slip"], row["form"]) in unseen
+        if told != (0 if right else recordings):
+            raise ValueError(f"the page says otherwise of {row['slip']}, {row['form']}")
+    if column("wrong_frames", "good_or_fair", slip="poses in cm") != [0, 0, 0]:
+        raise ValueError("the page says that poses in cm are never good or fair")
+    return [recordings, len({row["slip"] for row in rows} - {"none"})]
+
+
+claim(
+    VERDICT,
+    "`wrong_frames`: {:.0f} recordings, in mm, in pixels of known and in pixels of unknown size, "
+    "as they are and with each of {:.0f} faults",
+    _wrong_frames,
+)
 
 
 # False alarms.
