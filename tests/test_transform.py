@@ -355,6 +355,12 @@ def test_tus_rec_scan(tmp_path):
         file["x"] = 1
     with pytest.raises(FormatError, match=r"other\.h5: is no scan of TUS-REC"):
         read_scan(tmp_path / "other.h5")
+    with h5py.File(tmp_path / "rec.h5", "w") as file:
+        file.create_group("calibration")
+    with pytest.raises(FormatError, match=r"rec\.h5: is a recording of jaxcal already"):
+        read_scan(tmp_path / "rec.h5")
+    with pytest.raises(FormatError, match=r"rec\.h5: is a recording: calibrate it first"):
+        load_calibration(tmp_path / "rec.h5")
     with h5py.File(tmp_path / "none.h5", "w") as file:
         file["tforms"] = transforms[:0]
     with pytest.raises(FormatError, match=r"none\.h5: holds no frames"):

@@ -180,10 +180,9 @@ def _read_text(path: str | os.PathLike[str]) -> tuple[str, np.ndarray, np.ndarra
 def _read_hdf5(root: Node) -> tuple[str, np.ndarray, np.ndarray]:
     transforms = group(root, "TransformGroup")
     if transforms is None:
-        raise FormatError(
-            "is not an ITK transform: /TransformGroup is missing (a recording must be calibrated "
-            "first: jaxcal calibrate)"
-        )
+        if child(root, "calibration") is not None:
+            raise FormatError("is a recording: calibrate it first (jaxcal calibrate)")
+        raise FormatError("is not an ITK transform: /TransformGroup is missing")
     if child(transforms, "1") is not None:
         raise FormatError("holds several transforms; it must hold only one")
     one = group(transforms, "0")

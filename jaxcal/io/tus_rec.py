@@ -45,10 +45,13 @@ def read_scan(path: str | os.PathLike[str]) -> TrackedSequence:
     check_readable(path)
     with naming(path), open_root(path) as root:
         transforms = child(root, "tforms")
+        if transforms is None and child(root, "calibration") is not None:
+            raise FormatError(
+                "is a recording of jaxcal already: jaxcal calibrate takes it; other commands take "
+                "the file from which it was imported"
+            )
         if transforms is None:
-            ours = " (jaxcal calibrate takes jaxcal's recordings as they are)"
-            hint = "" if child(root, "calibration") is None else ours
-            raise FormatError(f"is no scan of TUS-REC: /tforms is missing{hint}")
+            raise FormatError("is no scan of TUS-REC: /tforms is missing")
         poses = array(transforms, (UpTo(MOST_FRAMES, "frames"), 4, 4))
         if not len(poses):
             raise FormatError("holds no frames")
