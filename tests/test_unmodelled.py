@@ -18,7 +18,7 @@ from jaxcal.diagnostics.misfits import misfits
 from jaxcal.diagnostics.serial_errors import correlation, independent
 from jaxcal.diagnostics.unmodelled import likelihood_ratio, unmodelled
 from jaxcal.model.image_points import rms_distance
-from jaxcal.report.accuracy import region_of
+from jaxcal.report.accuracy import region_of, settle
 from jaxcal.report.record import calibration_record
 from jaxcal.report.verdict import advice, verdict
 
@@ -423,6 +423,36 @@ def test_conventional_fits_are_looked_at_too(kind):
         right = jaxcal.calibrate(clean(seed), "conventional").record()["tre"]
         assert right["unmodelled"] is None
     assert sum(found) >= 3
+
+
+def test_a_tracker_of_another_scale_is_told_and_in_the_error():
+    """The images alone do not tell it from pixels that are stated too large."""
+    recording = clean(1)
+    poses = recording.calibration.poses.copy()
+    poses[:, :3, 3] *= 1.03
+    points, there = recording.calibration.measurements, recording.truth.image_to_probe
+    result = jaxcal.calibrate(jaxcal.Problem.from_arrays(poses, points), "conventional")
+    record = result.record()
+    tre = record["tre"]
+    assert tre["unmodelled"]["tracker_share"] == pytest.approx(-0.03, abs=0.01)
+    assert "if they are right, tracked positions are too long by" in tre["contradictions"][-1]
+    grid = region_of(result.numpy(), recording).grid()[:, [0, 2]]
+    off = rms_distance(np.asarray(result.image_to_probe), there, grid)
+    assert tre["stated_interval_mm"][1] < off < tre["interval_95_mm"][1]
+    # Another cause that is nearly as likely is told as well.
+    tre["unmodelled"]["also"] = {"kind": "beside", "values": [7.0], "images": None}
+    settle(record)
+    assert tre["contradictions"][-1].endswith(
+        "; so would a target 7.0 mm beside the image plane in all images: take images from both "
+        "sides of it"
+    )
+    for factor, told in ((1.0, False), (1.03, True)):
+        poses[:, :3, 3] = factor * recording.calibration.poses[:, :3, 3]
+        pixels = jaxcal.Problem.from_arrays(
+            poses, points / 0.1, kind="pixel", spacing_mm=(0.1, 0.1)
+        )
+        warned = jaxcal.calibrate(pixels, "conventional", estimate="scale").warnings
+        assert any("% larger than stated" in words for words in warned) == told
 
 
 @pytest.mark.parametrize("images", [10, 14])

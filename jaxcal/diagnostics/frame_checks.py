@@ -140,8 +140,8 @@ def wrong_frames(problem: Problem, estimate: tuple[str, ...] = ()) -> str | None
             return told
     if _is_overdetermined(count) and apart > max(UNFIT_MM, UNFIT * extent):
         return (
-            f"the images do not fit together (typical error {apart:.2g} mm, of a target that moves "
-            f"by {extent:.2g} mm in them): do poses and points belong together, with times of one "
+            f"the images do not fit together (typical error {_mm(apart)}, of a target that moves "
+            f"by {_mm(extent)} in them): do poses and points belong together, with times of one "
             "clock, is it one target in all images, and in which frames and conventions are the "
             "poses?"
         )
@@ -221,6 +221,11 @@ def _is_overdetermined(count: int) -> bool:
 def _another_unit(scales: Float[np.ndarray, " 2"]) -> bool:
     """Whether both axes are too long, or both too short, by more than anybody misstates them."""
     return bool((scales > STATED_TWICE).all() or (scales < 1 / STATED_TWICE).all())
+
+
+def _mm(length: float) -> str:
+    """Two digits, without an exponent for long ones."""
+    return f"{float(f'{length:.2g}'):g} mm"
 
 
 def _sizes(size: Float[np.ndarray, " 2"]) -> str:
@@ -404,6 +409,6 @@ def _wrong_scale(data: ImageData, fit: _Fit) -> str | None:
 def _sentence(words: str, before: float, after: float, count: int) -> str:
     worse, better = np.sqrt(before / count), np.sqrt(after / count)
     return (
-        f"it looks as if {words} (root mean square error {worse:.2g} mm as given, {better:.2g} mm "
-        "once corrected)"
+        f"it looks as if {words} (root mean square error {_mm(worse)} as given, {_mm(better)} once "
+        "corrected)"
     )

@@ -50,6 +50,9 @@ _NEIGHBOURHOODS, _SHARE = 8, 0.1
 """Number of neighbourhoods, and the share of the positions in each."""
 _ROUNDS = 40
 """Rounds of expectation maximisation; further ones raise the likelihood hardly."""
+_ALIKE = 0.5
+"""Shares of two lengths are alike if the smaller is at least so much of the larger: few images
+determine them no better."""
 _UNDETERMINED = 1e-6
 """Information on unknowns of unit columns, for those that some kinds of errors do not determine:
 errors within the image plane say nothing of a motion of the image along its normal."""
@@ -140,6 +143,20 @@ def neighbourhoods(positions: Float[Array, "n 3"]) -> list[Bool[Array, " n"]]:
         near[np.argsort(away)[: max(2, round(_SHARE * len(positions)))]] = True
         found.append(near)
     return found
+
+
+def too_short(shares: Float[Array, " 2"]) -> float | None:
+    """By which share tracked positions may be too short if the image is too large by these shares.
+
+    Only the lengths' ratio shows in the images. So a marker that is printed too small, say, is not
+    told from pixels that are stated too large, if the image is too large along both axes.
+
+    Returns:
+        None if the two shares are not alike.
+    """
+    small, large = np.sort(np.abs(shares))
+    alike = shares.prod() > 0 and small >= _ALIKE * large
+    return float(shares.mean()) if alike else None
 
 
 @dataclass(frozen=True)

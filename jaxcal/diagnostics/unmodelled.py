@@ -60,7 +60,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxcal.data.problem import Problem
 from jaxcal.diagnostics import tracker_distortion
 from jaxcal.diagnostics.change_point import change_point
 from jaxcal.diagnostics.channel_points import as_points, excess_of_points
@@ -110,6 +109,8 @@ SMALLEST_FIELD_MM = 0.05
 without noise what the linearisation leaves out looks like one."""
 _AT_ONCE = ("step", "displaced")
 """Errors that begin with one image; where is looked for."""
+MOTIONS = {"slip", *_AT_ONCE}
+"""Motions of the image on the probe, or of the target."""
 _PLACES = 16
 """As so many places that are independent of one another count all at which a step may be."""
 SIDE_MM = 20.0
@@ -146,16 +147,25 @@ class Unmodelled:
     image: int | None = None
     images: tuple[int, ...] = ()
 
+    @property
+    def tracker_share(self) -> float | None:
+        """By which share tracked positions are too short, if that explains a scale as well."""
+        return tracker_distortion.too_short(self.values) if self.kind == "scale" else None
+
     def moved(
-        self, points: Float[Array, "m 2"], jacobian: Float[Array, "m 3 p"], problem: Problem
+        self, points: Float[Array, "m 2"], jacobian: Float[Array, "m 3 p"], answer: Calibration
     ) -> tuple[float, float]:
         """Root mean square motion of image points, mm: if it is corrected, and of a slip.
+
+        Of a scale, the larger one of correcting the points or the tracked positions.
 
         Args:
             points: [lateral, axial], mm.
             jacobian: their derivatives by the unknowns.
-            problem: of the calibration.
+            answer: the calibration, with its problem.
         """
+        problem = answer.problem
+        assert problem is not None
         by = jacobian[..., : len(self.step)] @ self.step
         if self.kind in _OF_POINTS:
             lateral, axial = points.T
@@ -172,8 +182,14 @@ class Unmodelled:
             slip = jacobian[..., WITHIN] @ self.values
             # At the end of the recording.
             by = by + 0.5 * slip
-        size = [float(np.sqrt(np.sum(each**2) / len(points))) for each in (by, slip)]
-        return size[0], size[1]
+        corrected = [by]
+        if self.tracker_share is not None:
+            # Longer positions put the image farther from the probe's origin by the same share.
+            transform = np.asarray(answer.image_to_probe)
+            place = np.insert(points, 1, 0.0, axis=1) + transform[:3, 3] @ transform[:3, :3]
+            corrected.append(by + self.tracker_share * place)
+        size = [float(np.sqrt(np.sum(each**2) / len(points))) for each in (*corrected, slip)]
+        return max(size[:-1]), size[-1]
 
 
 def unmodelled(
@@ -223,7 +239,7 @@ def _clearest_first(found: list[Unmodelled]) -> list[Unmodelled]:
     """
     ordered = sorted(found, key=lambda each: -each.statistic / _BY_CHANCE[each.kind])
     cost = {"slip": 0.0, **dict.fromkeys(_AT_ONCE, 2 * math.log(_PLACES))}
-    motions = [k for k, each in enumerate(ordered) if each.kind in cost]
+    motions = [k for k, each in enumerate(ordered) if each.kind in MOTIONS]
     likelier = sorted((ordered[k] for k in motions), key=lambda e: cost[e.kind] - e.statistic)
     for k, each in zip(motions, likelier, strict=True):
         ordered[k] = each

@@ -10,7 +10,9 @@ from jaxcal.diagnostics.directions import observability
 from jaxcal.diagnostics.image_errors import KINDS
 from jaxcal.diagnostics.misfits import misfits
 from jaxcal.diagnostics.outliers import listed_outliers, outliers, suspects_in_words
+from jaxcal.diagnostics.tracker_distortion import too_short
 from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
+from jaxcal.model.unknowns import block_slice
 from jaxcal.result.calibration import Calibration, check_one
 from jaxcal.runtime.messages import enumerated
 from jaxcal.solvers.plan import TUNED
@@ -27,6 +29,9 @@ USUAL_PIXEL_MM = (0.02, 1.0)
 """Estimated pixel sizes outside this interval lead to a warning."""
 _MILLIMETRE = 0.1
 """So do pixels whose sides are 1 mm to within this share: points in mm look like that."""
+UNLIKELY_STATED_SDS, LEAST_MISSTATED = 4.0, 0.005
+"""Estimated pixels contradict their stated size if they differ from it by more than so many SDs and
+by more than this share."""
 FARTHEST_MM = 800.0
 """If the target is farther from the origin of the probe's frame, there is a warning. Instruments
 that are tracked at their handle are half a metre long."""
@@ -72,6 +77,7 @@ def warnings(result: Calibration) -> list[str]:
         *_weak_elevation(result),
         *_medium_warnings(result),
         *_unusual_pixels(result),
+        *_other_than_stated(result),
         *_far_from_probe(result),
         *(f"{MISFIT}: {text}" for text in (misfits(result) if converged else [])),
         *(suspects_in_words(result) if converged else []),
@@ -298,6 +304,27 @@ def _unusual_pixels(result: Calibration) -> list[str]:
     return [
         f"pixels of {lateral:.3g} x {axial:.3g} mm are unusual for ultrasound ({least:g} to "
         f"{largest:g} mm): are the poses' translations in mm?"
+    ]
+
+
+def _other_than_stated(result: Calibration) -> list[str]:
+    """Pixels that come out larger, or smaller, than stated by the same share along both axes."""
+    problem, size = result.problem, result.scale_mm_per_px
+    if size is None or problem is None or not (problem.spacing_known and "scale" in result.blocks):
+        return []
+    axes = block_slice(result.blocks, "scale")
+    sd = float(np.sqrt(result.unknowns_covariance[axes, axes].mean()))
+    excess = np.log(np.asarray(size, float) / np.asarray(problem.spacing, float))
+    share = too_short(-excess)
+    if share is None or not abs(share) > max(UNLIKELY_STATED_SDS * sd, LEAST_MISSTATED):
+        return []
+    larger, long = ("smaller", "short") if share > 0 else ("larger", "long")
+    off = abs(share) * float(np.linalg.norm(result.image_to_probe[:3, 3]))
+    percent = f"{100 * abs(share):.1f} %"
+    return [
+        f"the pixels come out {percent} {larger} than stated: is the stated size wrong? If it is "
+        f"right, tracked positions are too {long} by this share (check the tracker with a known "
+        f"distance, and the size of its markers), and the image is off by about {off:.1f} mm"
     ]
 
 

@@ -30,7 +30,7 @@ from jaxcal.diagnostics.image_errors import KINDS, ImageErrors, noise_covariance
 from jaxcal.diagnostics.influence import Influence, conventional_fit, excess, in_image, influence_of
 from jaxcal.diagnostics.intervals import image_jacobian, predicted_tre, tre_at, tre_over
 from jaxcal.diagnostics.outlier_agreement import agreeing_outliers, apart_in_image
-from jaxcal.diagnostics.unmodelled import unmodelled
+from jaxcal.diagnostics.unmodelled import MOTIONS, Unmodelled, unmodelled
 from jaxcal.diagnostics.warnings import different_poses
 from jaxcal.model.image_points import mean_of_squares
 from jaxcal.report.contradictions import contradictions
@@ -44,6 +44,8 @@ from jaxcal.solvers.closed_form.single import in_closed_form, solve_problem
 _ACROSS = 15
 """Number of points along each side of the map."""
 _MOST_NAMED = 5
+NEARLY = 6.0
+"""Errors are nearly as likely as the clearest one if their 2 ln LR is smaller by less than this."""
 
 
 def accuracy_record(
@@ -211,24 +213,33 @@ def scatter_shares(answer: Calibration) -> Float[np.ndarray, " kinds"]:
 def _unmodelled(
     answer: Calibration, grid: Float[np.ndarray, "m 2"], velocity: Float[np.ndarray, "n 6"] | None
 ) -> dict[str, Any] | None:
-    """The clearest error that the model leaves out, and how far it moves the image."""
+    """The clearest error that the model leaves out, and how far it moves the image.
+
+    One imitates another, so ``also`` is the next one if it is nearly as likely.
+    """
     found = unmodelled(answer, velocity)
     if not found:
         return None
-    # One imitates another: only the clearest is told.
-    first, problem = found[0], answer.problem
-    assert problem is not None
     jacobian = np.asarray(image_jacobian(answer, grid))
-    moved, slip = first.moved(grid, jacobian, problem)
-    return {
-        "kind": first.kind,
-        "values": first.values,
-        "statistic": first.statistic,
-        "moved_mm": moved,
-        "slip_mm": slip if first.kind in ("slip", "step") else None,
-        "image": first.image,
-        "images": list(first.images) or None,
-    }
+
+    def told(one: Unmodelled) -> dict[str, Any]:
+        moved, slip = one.moved(grid, jacobian, answer)
+        return {
+            "kind": one.kind,
+            "values": one.values,
+            "tracker_share": one.tracker_share,
+            "statistic": one.statistic,
+            "moved_mm": moved,
+            "slip_mm": slip if one.kind in ("slip", "step") else None,
+            "image": one.image,
+            "images": list(one.images) or None,
+        }
+
+    first = found[0]
+    near = (each for each in found[1:] if first.statistic - each.statistic < NEARLY)
+    # What is said of one motion asks for the others as well.
+    also = next((each for each in near if {first.kind, each.kind} - MOTIONS), None)
+    return {**told(first), "also": also and told(also)}
 
 
 def _comparison(

@@ -241,8 +241,12 @@ def _from_unmodelled(record: dict[str, Any]) -> list[tuple[float, str]]:
         # To first order the answer moves by less than it is wrong by, which in simulation was
         # of the order of the distance.
         moved = max(moved, math.hypot(*found["values"]))
-    what, advice = _explanation(found, pixels=record["scale_mm_per_px"] is not None)
+    pixels = record["scale_mm_per_px"] is not None
+    what, advice = _explanation(found, pixels=pixels)
     words = f"{what} would explain the errors far better: {advice}"
+    if found["also"] is not None:
+        what, advice = _explanation(found["also"], pixels=pixels)
+        words += f"; so would {what}: {advice}"
     return [(math.hypot(1.0, moved / stated), words)]
 
 
@@ -260,12 +264,18 @@ def _explanation(found: dict[str, Any], *, pixels: bool) -> tuple[str, str]:
             least = _WORTH_NAMING * max(map(abs, values))
             lengths = ("lateral positions", values[0]), ("ranges", values[1])
             told = [f"{what} that are {_too_long(by)}" for what, by in lengths if abs(by) >= least]
-            return (
-                " and ".join(told),
-                "check pixel size, sound speed and the tracker's unit, or estimate the scale"
+            points = (
+                "check pixel size and sound speed, or estimate the scale"
                 if pixels
                 else "check what gave the points their mm (pixel size, sound speed, pitch of the "
-                "elements) and the tracker's unit",
+                "elements)"
+            )
+            if (share := found["tracker_share"]) is None:
+                return " and ".join(told), points
+            return (
+                " and ".join(told),
+                f"{points}; if they are right, tracked positions are {_too_long(-share)} (check "
+                "the tracker with a known distance, and the size of its markers)",
             )
         case "lateral":
             return (
