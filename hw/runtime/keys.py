@@ -182,10 +182,13 @@ class _Terminal:
         self._before = _termios().tcgetattr(self._number)
 
     def keys(self) -> None:
+        if self._ours():
+            self._read_keys(_termios().TCSAFLUSH)
+
+    def _read_keys(self, when: int) -> None:
         import tty
 
-        if self._ours():
-            tty.setcbreak(self._number)
+        tty.setcbreak(self._number, when)
 
     def lines(self) -> None:
         termios = _termios()
@@ -194,8 +197,6 @@ class _Terminal:
 
     def typed(self) -> bytes | None:
         """What was typed within a short time; None when the terminal is gone."""
-        import tty
-
         termios = _termios()
         try:
             if not _is_foreground(self._number):
@@ -203,7 +204,7 @@ class _Terminal:
                 return b""
             if termios.tcgetattr(self._number)[3] & termios.ICANON:
                 # After Ctrl-Z and fg the terminal reads by lines, as the shell left it.
-                tty.setcbreak(self._number, termios.TCSANOW)
+                self._read_keys(termios.TCSANOW)
             if not self._waiting():
                 return b""
             typed = os.read(self._number, 256)
