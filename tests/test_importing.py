@@ -372,7 +372,7 @@ def test_poses_and_points_in_two_tables(tmp_path, key, reverse):
     np.testing.assert_array_equal(found.recording.calibration.measurements, PIXELS[order[used]])
     kept = 10 * order[used] if key == "frames" else np.flatnonzero(used)
     np.testing.assert_array_equal(found.recording.calibration.frame, kept)
-    assert found.notes[-1].endswith("are used, as told")
+    assert found.notes[-1].endswith("are used")
     assert found.most_lost is False
 
 
@@ -383,7 +383,7 @@ def test_only_some_rows_of_a_table(tmp_path):
     recording, notes, *_ = import_files([path], ImportOptions(frames=(0, 1, 2, 3)))
     np.testing.assert_allclose(recording.calibration.poses, POSES[:4], atol=1e-12)
     np.testing.assert_array_equal(recording.calibration.time, [0, 1, 2, 3])
-    assert notes == [f"only frames 0 to 3 of {path} are used, as told"]
+    assert notes == [f"only frames 0 to 3 of {path} are used"]
     with pytest.raises(InputError, match=r"t\.csv: has frames 0 to 5, none of --frames 7 to 9"):
         import_files([path], ImportOptions(frames=(7, 8, 9)))
     pair = tmp_path / "poses.txt", tmp_path / "points.txt"

@@ -158,7 +158,7 @@ def test_only_some_frames_of_a_sequence(tmp_path, sequence, capsys):
     out = tmp_path / "o.h5"
     assert main(["import", str(sequence), str(out), "--frames", "1-4,6,8-20"]) == 0
     said = capsys.readouterr().out.splitlines()
-    told = f"- only frames 1 to 4, 6, 8 to 20 of {sequence} are used, as told (12 of these 18 "
+    told = f"- only frames 1 to 4, 6, 8 to 20 of {sequence} are used (12 of these 18 "
     assert told + "numbers name no frame)" in said
     assert "- 1 of 6 frames left out: their tracking was not OK" in said
     assert not any("credible" in line or "image was" in line for line in said)

@@ -113,7 +113,7 @@ def selected(
         raise InputError(f"{name}: has {there}, none of --frames {asked}")
     unknown = len(options.frames) - len(np.unique(numbers[chosen]))
     lost = f" ({unknown} of these {len(options.frames)} numbers name no frame)" if unknown else ""
-    return chosen, [f"only frames {asked} of {name} are used, as told{lost}"]
+    return chosen, [f"only frames {asked} of {name} are used{lost}"]
 
 
 SEQUENCES = ("sequence", "tracker", "scan", "folder")
