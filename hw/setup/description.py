@@ -262,6 +262,8 @@ def _setup(tables: dict[str, Any]) -> Setup:
     ultrasound = _ultrasound(found["ultrasound"])
     if not found["limits"]:
         raise InputError("[limits] is missing: without it nothing may move")
+    if not found["limits"].get("hull_mm", True):
+        raise InputError("[limits] hull_mm must have corners: without it, it is the housing's")
     robot = _robot(found["robot"])
     housing = found["probe"].pop("housing_mm", None)
     if housing is not None:

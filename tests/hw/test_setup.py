@@ -111,6 +111,7 @@ def test_a_description_is_read(tmp_path):
         ('"192.168.1.10"', '"a..b"', r"\[robot\] host 'a\.\.b' is not the name or address"),
         ("[search]", "[serach]", "is not known"),
         ("[search]", "[search]\nreach_mm = 30", r"\[search\] reach_mm is 30, but .* only 25"),
+        ("search_mm = 25", "search_mm = 25\nhull_mm = []", r"\[limits\] hull_mm must have corners"),
         ("search_mm = 25", "", r"\[limits\] search_mm of 0 leaves no room for the search"),
         ("fine_mm = 0.2", "fine_mm = -0.2", r"\[search\] fine_mm must be above 0 and at most 50"),
         (
