@@ -158,7 +158,7 @@ def fit_spot(
     if (np.abs(unknowns[:2] - start) > 1 + np.array([extent[1], extent[0]])).any():
         raise NotFoundError("the fit left the bright spot")
 
-    value, _ = window.model(unknowns)
+    value, _ = fit.model(unknowns)
     if not np.isfinite(value).all():
         raise NotFoundError("no spot could be fitted")
     width = _width(unknowns)
@@ -263,17 +263,24 @@ class _Fit:
     def __init__(self, window: _Window, first: np.ndarray, steps: np.ndarray, top: float) -> None:
         self._window, self._first, self._steps, self._top = window, first, steps, top
         self._hold = np.diag(_HOLD / steps)[3:]
+        self._last: tuple[np.ndarray, tuple[np.ndarray, np.ndarray]] | None = None
+
+    def model(self, unknowns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """As the window's; once where residual and slope are asked for at the same unknowns."""
+        if self._last is None or not np.array_equal(self._last[0], unknowns):
+            self._last = unknowns.copy(), self._window.model(unknowns)
+        return self._last[1]
 
     def residual(self, unknowns: np.ndarray) -> np.ndarray:
         """Pixels, as shares of the brightest, and what holds the shape."""
         window = self._window
-        pixels = (window.model(unknowns)[0] - window.pixels)[window.use] / self._top
+        pixels = (self.model(unknowns)[0] - window.pixels)[window.use] / self._top
         return np.concatenate([pixels, self._hold @ (unknowns - self._first)])
 
     def slope(self, unknowns: np.ndarray) -> np.ndarray:
         """Derivatives of :meth:`residual`."""
-        window = self._window
-        return np.concatenate([window.model(unknowns)[1][window.use] / self._top, self._hold])
+        slope = self.model(unknowns)[1][self._window.use]
+        return np.concatenate([slope / self._top, self._hold])
 
     def solve(self) -> Float[np.ndarray, " unknowns"] | None:
         """The unknowns, or None where there is no solution."""
