@@ -54,9 +54,11 @@ REFLECTED = b"-1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"
 
 
 def bomb(content: bytes) -> bytes:
-    """Pixels that inflate to a gigabyte."""
-    packer = zlib.compressobj(1)
-    packed = b"".join(packer.compress(bytes(1 << 20)) for _ in range(1000)) + packer.flush()
+    """Pixels that inflate to a gigabyte: a megabyte compressed once, a thousand times."""
+    packer = zlib.compressobj(1, wbits=-15)
+    block = packer.compress(bytes(1 << 20)) + packer.flush(zlib.Z_FULL_FLUSH)
+    checksum = (1000 << 20) % 65521 << 16 | 1
+    packed = b"\x78\x01" + 1000 * block + packer.flush() + checksum.to_bytes(4, "big")
     head = content[: content.index(b"LOCAL\n") + 6]
     head = re.sub(rb"CompressedDataSize = \d+", b"CompressedDataSize = %d" % len(packed), head)
     return re.sub(rb"DimSize = \d+ \d+ 5", b"DimSize = 8000 8000 5", head) + packed
