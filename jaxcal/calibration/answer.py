@@ -387,8 +387,9 @@ def inverse_and_observability(
     degenerate = jnp.logical_not(observable)
     # With nearly exact data the limit is below rounding, and then no direction counts as weak.
     below = jnp.logical_not(exceeds) & (bounded | (eps * total < least))
-    # SDs so different that the matrix is singular to rounding determine nothing either.
-    below = below | jnp.logical_not(positive)
+    # SDs so different that the matrix is singular to rounding determine nothing either: a pivot is
+    # not positive, or the smallest eigenvalue is less than the rounding of the largest.
+    below = below | jnp.logical_not(positive) | (largest * eps * total > 1)
     found = Observability(
         degenerate=degenerate, weak=below & (not bounded), singular=degenerate | (below & bounded)
     )
