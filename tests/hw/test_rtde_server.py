@@ -41,6 +41,7 @@ def disconnect(*clients) -> None:
         list(pool.map(lambda client: client.disconnect(), clients))
 
 
+@pytest.mark.real_time
 def test_ur_rtde_receives_and_controls():
     """Both series at once: most of it is waiting."""
     with ThreadPoolExecutor(2) as pool:
@@ -56,13 +57,11 @@ def receive_and_control(version: tuple[int, ...]) -> None:
         assert receive.getRobotMode() == 7
         assert control.isProgramRunning()
         assert control.getTCPOffset() == pytest.approx((0.0, 0.0, 0.1, 0.0, 0.0, 0.0))
-        # ur_rtde stores a packet's registers one by one and returns once the first says done: on a
-        # busy machine it may then read the result of the command before.
-        until(lambda: control.isPoseWithinSafetyLimits(beside(10.0)))
-        until(lambda: not control.isPoseWithinSafetyLimits([2.0, 0.0, 0.3, 0.0, 3.0, 0.2]))
+        assert control.isPoseWithinSafetyLimits(beside(10.0))
+        assert not control.isPoseWithinSafetyLimits([2.0, 0.0, 0.3, 0.0, 3.0, 0.2])
 
         # Synchronous: back when there.
-        assert control.moveL(beside(10.0), 0.1, 1.0)
+        assert control.moveL(beside(10.0), 0.1, 1.0), robot.state()
         assert robot.state()["raw"] == pytest.approx(beside(10.0))
         until(control.isSteady)
 
