@@ -92,12 +92,14 @@ class Link:
                         client.sendall(held.pop(0)[1])
 
 
+@pytest.mark.real_time
 def test_a_question_that_was_held_up_does_not_end_the_run(tmp_path):
     """The delay of the echo frames was bounded by it, and only after 10 s by another one."""
+    path = Path(tempfile.mkdtemp(dir=tmp_path)) / "r.h5"
     with (
         EmulatedRobot() as robot,
         AuspisEmulator(silence, clock=robot.clock, lines=8) as emulator,
-        Recorder(tmp_path / "r.h5", RecordingHeader("pixel", {}, 8, settings="{}")) as recorder,
+        Recorder(path, RecordingHeader("pixel", {}, 8, settings="{}")) as recorder,
     ):
         scene = Scene(np.eye(4), np.array([400.0, -100.0, 0.0]), np.array([0.0, 0.0, -1.0]))
         setup = Setup(
