@@ -138,7 +138,7 @@ def test_a_narrow_cone_is_weak_but_solved():
 
 
 def test_sds_that_determine_nothing_to_rounding_are_told():
-    """The status was ``converged`` beside a covariance of NaN, or of a thousandth of the SDs."""
+    """The status was ``converged`` beside a covariance of NaN, or one far too small."""
     data = problem(3, images=16, noise_mm=0.1)
     for size in (1e6, 1e7):
         result = jaxcal.calibrate(data, prior="gaussian", sigma=(1 / size, 1 / size, size))
