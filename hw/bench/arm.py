@@ -129,8 +129,8 @@ class Arm:
             self.watcher(motion)
 
     def _plan(self, t: float, target: Sequence[float], speed: float, acceleration: float) -> Motion:
-        position, quaternion, error = self._where(t)
-        tcp = self._motion.tcp
+        motion = self._motion
+        position, quaternion, error = _where(motion, t)
         goal = _six(target)
         travel = tuple(b - a for a, b in zip(position, goal[:3], strict=True))
         turn = _rotation_vector(_multiply(_quaternion(goal[3:]), _conjugate(quaternion)))
@@ -152,8 +152,8 @@ class Arm:
             speed,
             acceleration,
             error=(error, drawn),
-            planned_tcp=tcp,
-            tcp=tcp,
+            planned_tcp=motion.tcp,
+            tcp=motion.tcp,
         )
 
     def servo(self, t: float, target: Sequence[float], duration: float) -> None:
@@ -181,13 +181,15 @@ class Arm:
 
     def raw(self, t: float) -> Vector:
         """Pose by the encoders at bench time t: m and rotation vector (rad)."""
-        position, quaternion, _ = self._where(t)
+        position, quaternion, _ = _where(self._motion, t)
         return position + _rotation_vector(quaternion)
 
     def true_raw(self, t: float) -> Vector:
         """Where the tool really is at bench time t: m and rotation vector (rad)."""
-        position, quaternion, error = self._where(t)
-        position, quaternion = _retooled(position, quaternion, self._motion.tcp, self._tool)
+        # Once: where this arm mirrors one in another process, a thread takes over its motions.
+        motion = self._motion
+        position, quaternion, error = _where(motion, t)
+        position, quaternion = _retooled(position, quaternion, motion.tcp, self._tool)
         moved = tuple(p + e for p, e in zip(position, error, strict=False))
         return moved + _rotation_vector(_multiply(_quaternion(error[3:]), quaternion))
 
@@ -259,16 +261,16 @@ class Arm:
         low, high = _REACH_M
         return all(math.isfinite(v) for v in raw) and low <= math.hypot(*raw[:3]) <= high
 
-    def _where(self, t: float) -> tuple[Vector, Vector, Vector]:
-        """Position and orientation of the TCP that is reported, and the arm's error."""
-        moving = self._motion
-        part = 0.0 if moving.length == 0.0 else moving.at(t)[0] / moving.length
-        position = tuple(p + part * d for p, d in zip(moving.position, moving.travel, strict=True))
-        step = _quaternion(tuple(part * w for w in moving.turn))
-        first, last = moving.error
-        error = tuple(a + part * (b - a) for a, b in zip(first, last, strict=True))
-        quaternion = _multiply(step, moving.quaternion)
-        return *_retooled(position, quaternion, moving.planned_tcp, moving.tcp), error
+
+def _where(motion: Motion, t: float) -> tuple[Vector, Vector, Vector]:
+    """Position and orientation of the TCP that is reported, and the arm's error."""
+    part = 0.0 if motion.length == 0.0 else motion.at(t)[0] / motion.length
+    position = tuple(p + part * d for p, d in zip(motion.position, motion.travel, strict=True))
+    step = _quaternion(tuple(part * w for w in motion.turn))
+    first, last = motion.error
+    error = tuple(a + part * (b - a) for a, b in zip(first, last, strict=True))
+    quaternion = _multiply(step, motion.quaternion)
+    return *_retooled(position, quaternion, motion.planned_tcp, motion.tcp), error
 
 
 def _retooled(

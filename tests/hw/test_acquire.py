@@ -9,7 +9,6 @@ import resource
 import signal
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -325,7 +324,7 @@ def test_a_person_takes_an_image_skips_a_pose_and_stops(tmp_path):
     pytest.importorskip("pty", reason="there are no pseudo-terminals here")
     from terminal import Terminal
 
-    path = Path(tempfile.mkdtemp(dir=tmp_path)) / "rec.h5"
+    path = tmp_path / "rec.h5"
     code = "import sys; from hw.cli.main import main; sys.exit(main(sys.argv[1:]))"
     arguments = ["acquire", str(path), "--bench", "--bench-seed", "3", "--images", "4",
                  "--placement", "pattern-injection", "--operator", "person"]  # fmt: skip

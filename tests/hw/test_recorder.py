@@ -9,14 +9,12 @@ import resource
 import signal
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from functools import partial
-from pathlib import Path
 from types import SimpleNamespace
 
 import h5py
@@ -479,7 +477,7 @@ def slowed(recorder: Recorder) -> Iterator[None]:
 @pytest.mark.real_time
 def test_a_slow_disk_is_waited_for_while_it_takes_data(tmp_path):
     """It was told to have taken nothing, and the end of a long file was as late."""
-    path, recording = Path(tempfile.mkdtemp(dir=tmp_path)) / "rec.h5", simulated()
+    path, recording = tmp_path / "rec.h5", simulated()
     image = SimpleNamespace(**{**vars(frames(0, 1)[0]), "array": np.zeros((2048, 2048), np.uint8)})
     with Recorder(path, HEADER) as recorder:
         suspend(recorder._process.pid)

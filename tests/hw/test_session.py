@@ -7,12 +7,10 @@ import re
 import signal
 import socket
 import subprocess
-import tempfile
 import threading
 import time
 from contextlib import suppress
 from dataclasses import fields, replace
-from pathlib import Path
 
 import h5py
 import numpy as np
@@ -95,7 +93,7 @@ class Link:
 @pytest.mark.real_time
 def test_a_question_that_was_held_up_does_not_end_the_run(tmp_path):
     """The delay of the echo frames was bounded by it, and only after 10 s by another one."""
-    path = Path(tempfile.mkdtemp(dir=tmp_path)) / "r.h5"
+    path = tmp_path / "r.h5"
     with (
         EmulatedRobot() as robot,
         AuspisEmulator(silence, clock=robot.clock, lines=8) as emulator,
@@ -168,7 +166,7 @@ def test_a_frame_of_before_the_probe_came_to_rest_is_not_measured(tmp_path, monk
         monkeypatch.setattr("hw.recording.session._PERIOD_WALL_S", 0.3)
     point = (PLAN.targets[2] @ [3.0, 0.0, 45.0, 1.0])[:3]
     scene = Scene(np.eye(4), point, np.array([0.0, 0.0, -1.0]))
-    path = Path(tempfile.mkdtemp(dir=tmp_path)) / "r.h5"
+    path = tmp_path / "r.h5"
     with (
         EmulatedRobot(version=CB_SERIES, speed=3.0) as robot,
         AuspisEmulator(silence, clock=robot.clock, lines=8) as emulator,
@@ -369,7 +367,7 @@ def test_devices_are_closed_though_closing_was_interrupted(tmp_path, monkeypatch
 @pytest.mark.real_time
 def test_a_suspension_is_no_fault_of_a_device(tmp_path, monkeypatch):
     """A run that was suspended (Ctrl-Z) for seconds ended, and blamed the ultrasound machine."""
-    path = Path(tempfile.mkdtemp(dir=tmp_path)) / "r.h5"
+    path = tmp_path / "r.h5"
     script = f"sleep 0.05; kill -STOP {os.getpid()}; sleep 1.1; kill -CONT {os.getpid()}"
     scene = Scene(np.eye(4), np.array([400.0, -100.0, 0.0]), np.array([0.0, 0.0, -1.0]))
     with (
