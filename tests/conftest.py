@@ -146,6 +146,14 @@ def _calls_are_checked():
     checked_calls.begin_test()
 
 
+@pytest.fixture(autouse=True)
+def _scheduling_is_kept():
+    """With real-time scheduling, this process would take a core from all that run beside it."""
+    yield
+    if sys.platform == "linux":
+        assert os.sched_getscheduler(0) == os.SCHED_OTHER
+
+
 @pytest.fixture(scope="session")
 def real_data() -> Path:
     if not REAL_DATA.is_dir():
