@@ -357,7 +357,7 @@ def speed(folder, quick: bool) -> None:
         answers = jaxcal.calibrate_closed_form(problems, estimate=estimate)
         batch = min(_timed(lambda p=problems, e=estimate: jaxcal.calibrate_closed_form(
             p, estimate=e)) for _ in range(20))  # fmt: skip
-        one = jax.tree.map(lambda leaf: leaf[0], problems)
+        one = problems[0]
         single = min(_timed(lambda p=one, e=estimate: jaxcal.calibrate_closed_form(
             p, estimate=e)) for _ in range(50))  # fmt: skip
         share = float(np.mean(answers.certified))

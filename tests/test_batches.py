@@ -152,7 +152,16 @@ def test_to_stack_problems_and_to_take_answers_compiles_nothing():
     assert isinstance(found.rms, jax.Array)
     with compiled_programs() as compiled:
         one, some = found[5], found[np.arange(7) > 4]
+        sixth, last = batch[5], batch[-3:]
     assert compiled == []
+    assert (len(batch), len(last), sixth.batch_shape) == (7, 3, ())
+    assert isinstance(sixth.poses, jax.Array)
+    np.testing.assert_array_equal(sixth.poses, problems[5].poses)
+    assert [each.images for each in last] == [IMAGES] * 3
+    again = jaxcal.calibrate_batch(last, "conventional")
+    np.testing.assert_array_equal(again.image_to_probe, found.image_to_probe[-3:])
+    with pytest.raises(jaxcal.InputError, match="one problem, not a batch of them"):
+        list(sixth)
     assert isinstance(one.rms, jax.Array)
     assert (one.rms, one.problem.poses.dtype) == (found.rms[5], batch.poses.dtype)
     np.testing.assert_array_equal(some.point, found.point[5:])

@@ -155,7 +155,7 @@ def test_32_bits_where_they_are_asked_for():
     """As near to the recorded answers in 64 bits as it promises."""
     single = Options(precision="float32")
     family, answers = corpus.load("covariances24")
-    there = jax.tree.map(lambda leaf: leaf[0], family.problems(np.arange(1)))
+    there = family.problems(np.arange(1))[0]
     own = jaxcal.calibrate(there, options=single)
     reference = answers["auto", "batch"]["image_to_probe"][0]
     assert own.image_to_probe.dtype == own.elevation.dtype == jnp.float32
@@ -292,7 +292,7 @@ def check_the_documentations_own_observation(names: dict) -> None:
 
     fit, problems = names["fit"], names["problems"]
     assert np.all(fit.converged)
-    problem = jax.tree.map(lambda leaf: leaf[0], problems)
+    problem = problems[0]
     found = jax.tree.map(lambda leaf: leaf[0], fit.iterate.parameters())
     depth = np.asarray(problem.measurements)[:, 1]
     assert float(problem.face_offset) == 0

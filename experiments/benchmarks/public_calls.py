@@ -146,7 +146,7 @@ def program() -> dict[str, Any]:
         with jax.enable_x64(True):
             return len(defines.findall(jax.jit(call).lower(argument).as_text()))
 
-    one = jax.tree.map(lambda leaf: leaf[0], problems)
+    one = problems[0]
     return {
         "one problem": lines(jaxcal.calibrate, one),
         "load": load,

@@ -35,12 +35,13 @@ from jaxcal.model.outlying import stands_out
 from jaxcal.model.parameters import Parameters, retract
 from jaxcal.model.residuals import target_in_image
 from jaxcal.model.thresholds import FEWEST_TO_LEAVE_OUT
-from jaxcal.result.calibration import OneOrBatch, Status, check_one, status_names
+from jaxcal.result.calibration import Status, check_one, status_names
 from jaxcal.runtime import compiler, executables
 from jaxcal.runtime.array_types import AnyArray
 from jaxcal.runtime.arrays import first_images, is_traced
 from jaxcal.runtime.given_values import check_flag, real_array, truth_array
 from jaxcal.runtime.jax_modes import in_own_modes, inside_transformation, require_float64
+from jaxcal.runtime.one_or_batch import OneOrBatch
 from jaxcal.solvers import dense
 from jaxcal.solvers.consensus import ConsensusModel, find_consensus, linearise, studentised_errors
 from jaxcal.solvers.proposals import subset_systems

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import DTypeLike
@@ -43,6 +43,7 @@ from jaxcal.runtime.arrays import (
 from jaxcal.runtime.given_values import refuse_masked
 from jaxcal.runtime.jax_modes import importing_jax, in_own_modes
 from jaxcal.runtime.messages import counted, shown
+from jaxcal.runtime.one_or_batch import OneOrBatch
 
 _HOW = (
     "jaxcal.Problem.from_arrays(poses, measurements) makes one of arrays, jaxcal.load(path) reads "
@@ -82,8 +83,11 @@ class Channels:
 
 
 @array_tree
-class Problem:
+class Problem(OneOrBatch):
     """Tracked measurements of one target in n images; ``*batch`` may be empty.
+
+    A batch has a length, and parts: ``problems[0]`` is its first problem, ``problems[:10]`` a
+    smaller batch.
 
     Arrays are JAX's where JAX is imported, and otherwise numpy's, which JAX takes as well.
 
@@ -120,6 +124,8 @@ class Problem:
     pixels: bool = static(default=False)
     spacing_known: bool = static(default=True)
     curved: bool = static(default=False)
+
+    _one: ClassVar[str] = "one problem"
 
     def __post_init__(self) -> None:
         _make_floating(self)

@@ -6,7 +6,7 @@ import enum
 import os
 from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,14 +23,13 @@ from jaxcal.runtime.arrays import (
     array_module,
     array_tree,
     has_values,
-    is_on_one_processor,
     is_traced,
-    like,
     map_arrays,
     outline,
     static,
 )
 from jaxcal.runtime.given_values import check_made
+from jaxcal.runtime.one_or_batch import OneOrBatch
 from jaxcal.solvers.convergence import Convergence
 
 if TYPE_CHECKING:
@@ -140,61 +139,6 @@ class Linearisation:
     average_elevation_sd: Float[AnyArray, "*batch n"] | None
     further: Float[AnyArray, "*batch k"] | None
     prior_sd: Float[AnyArray, "*batch priors"] | None = None
-
-
-Answer = TypeVar("Answer", bound="OneOrBatch")
-
-
-class OneOrBatch:
-    """An answer about one problem, or a batch of them, with an array ``mask`` of (*batch, n)."""
-
-    mask: Any
-
-    def __getitem__(self: Answer, index: Any) -> Answer:
-        """Some answers of a batch.
-
-        Raises:
-            IndexError: beyond the batch.
-            InputError: for one answer, so that a loop over it does not end silently; a traced
-                index.
-        """
-        self._check_batch()
-        if is_traced(index):
-            raise InputError("a batch is not indexed by traced numbers: index each of its arrays")
-        given = index if isinstance(index, tuple) else (index,)
-        # JAX takes no lists.
-        given = tuple(np.asarray(each) if isinstance(each, list) else each for each in given)
-        axes = self.mask.ndim - 1
-        # Numpy raises an error for an index outside the batch; JAX would clip it.
-        np.empty(self.mask.shape[:-1])[given]
-
-        def taken(leaf: Any) -> AnyArray:
-            near = isinstance(leaf, np.ndarray) or is_on_one_processor(leaf)
-            # JAX would compile a program for every shape of a batch, and keep it.
-            whole = np.asarray(leaf) if near else leaf
-            # With all the other axes named, an ellipsis in the index stands for the batch's only.
-            part = whole[(*given, *(slice(None),) * (leaf.ndim - axes))]
-            # An element of a numpy array is a scalar, not an array.
-            return like(leaf, part) if near else part
-
-        return map_arrays(taken, self)
-
-    def __len__(self) -> int:
-        """Number of answers along the first axis of a batch.
-
-        Raises:
-            InputError: for one answer.
-        """
-        self._check_batch()
-        return self.mask.shape[0]
-
-    def __bool__(self) -> bool:
-        """True, also for an empty batch, and for one answer, which has no length."""
-        return True
-
-    def _check_batch(self) -> None:
-        if self.mask.ndim == 1:
-            raise InputError("this is one calibration, not a batch of them: it has no parts")
 
 
 @array_tree
