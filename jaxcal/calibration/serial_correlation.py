@@ -14,11 +14,12 @@ A share a of the variance of each kind is correlated by rho^|i - j| between imag
 is independent. The residuals do not show C_k as it is, since the fit absorbs slow errors more than
 quick ones. So every pair (rho, a) of a grid is weighed by its restricted likelihood given those
 residuals (profiled over the variance), times a prior: half for no correlation, the other half
-spread evenly over the grid. The other kinds enter with their mean weights, in turn. C_k is then the
-weighed mean, which is the law of total variance, since every pair has the same estimate. So SDs
-grow by one to three percent where errors look independent and the poses change at random; nothing
-decides whether errors are correlated. The correction makes no answer more certain. The information
-P of priors on sound speed and delay is added to both sums.
+spread evenly over the grid, and less where the variance would be very large. The other kinds enter
+with their mean weights, in turn. C_k is then the weighed mean, which is the law of total variance,
+since every pair has the same estimate. So SDs grow by one to three percent where errors look
+independent and the poses change at random; nothing decides whether errors are correlated. The
+correction makes no answer more certain. The information P of priors on sound speed and delay is
+added to both sums.
 
 *Slow paths.* Where the probe was placed anew for every image, errors have little reason to stay
 alike for long. Where it moved slowly all the time, whatever depends on its motion did so, too, and
@@ -74,6 +75,11 @@ ROUNDING_MM = 1e-9
 
 NEGLIGIBLE = 0.01
 """Errors with less than this share of the variance that they are given tell of no correlation."""
+
+LARGE = 10_000.0
+"""Mean of the exponential prior of a variance, relative to the one under independence. The fit
+absorbs nearly all of smooth errors that last longer than the recording, so that they may have any
+size, and the mean of the variances would be that of the least likely model."""
 
 ROUNDS, STEPS = 3, 3
 """Rounds over the kinds of error, and steps to the variance in each."""
@@ -274,6 +280,7 @@ def _factors(
                 continue
             cost = _restricted_cost(others + weighed[k] / variance[k][:, None, None])
             twice = cost + count * np.log(variance[k]) + log_det
+            twice += 2 * variance[k] / (LARGE * variance[k][0])
             likelihood = belief * np.exp(-0.5 * (twice - twice.min()))
             weight[k] = likelihood / likelihood.sum()
     return weight * variance / variance[:, :1]
