@@ -41,7 +41,6 @@ def disconnect(*clients) -> None:
         list(pool.map(lambda client: client.disconnect(), clients))
 
 
-@pytest.mark.real_time
 def test_ur_rtde_receives_and_controls():
     """Both series at once: most of it is waiting."""
     with ThreadPoolExecutor(2) as pool:

@@ -90,7 +90,6 @@ class Link:
                         client.sendall(held.pop(0)[1])
 
 
-@pytest.mark.real_time
 def test_a_question_that_was_held_up_does_not_end_the_run(tmp_path):
     """The delay of the echo frames was bounded by it, and only after 10 s by another one."""
     path = tmp_path / "r.h5"
