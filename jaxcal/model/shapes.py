@@ -188,7 +188,7 @@ def _sums(family: Family, abrupt: bool, window: Window) -> tuple[Array, Array, A
     parabola: Entry = 0
     for place, share in zip(np.arange(NODES) + 0.5, weight, strict=True):
         mass = value if family == "uniform" else value * profile(family, base)
-        total = unrolled.add(total, float(share) * mass)
+        total = unrolled.add(total, unrolled.times(1 if share == 1 else float(share), mass))
         line = unrolled.add(line, float(share * place) * mass)
         parabola = unrolled.add(parabola, float(share * place**2) * mass)
         value, ratio = value * ratio, ratio * bend

@@ -205,4 +205,4 @@ def _outer_products(
 
     XLA's reduction over an axis between others is much slower for large ones; it compiles sooner.
     """
-    return reduce(add, [first[:, k, None] * second[k] for k in range(len(second))])
+    return reduce(add, [first[:, k : k + 1] * second[k : k + 1] for k in range(len(second))])

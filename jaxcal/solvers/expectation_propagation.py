@@ -107,14 +107,11 @@ class Sites(eqx.Module):
     @jax.jit
     def variance(self, covariance: Float[Array, "6 6 batch"]) -> Float[Array, "batch n"]:
         """h_i' C h_i, mm^2: the variance of every image's offset."""
-        h, entry, size = self.direction, covariance[..., None], len(self.direction)
+        h, size = self.direction, len(self.direction)
         # Of the entries off the diagonal both are counted at once.
-        doubled = [
-            unrolled.add(
-                *(unrolled.times(1 if i == j else 2, entry[i, j] * h[j]) for j in range(i, size))
-            )
-            for i in range(size)
-        ]
+        both = 2.0 - np.eye(size, dtype=covariance.dtype)
+        entry = (both[..., None] * covariance)[..., None]
+        doubled = [unrolled.add(*(entry[i, j] * h[j] for j in range(i, size))) for i in range(size)]
         return unrolled.dot(h, doubled)
 
 

@@ -107,9 +107,10 @@ def traces(
     rows, columns = np.triu_indices(unknowns_of(flat))
     twice = np.where(rows == columns, 1, 2).astype(matrix.dtype)[:, None]
     entries = picked(matrix.reshape(-1, matrix.shape[-1]), len(matrix) * rows + columns)
-    # XLA's reduction over this axis takes twice as long.
-    entries = barrier(twice * entries)
-    return reduce(add, [entries[k] * flat[:, k] for k in range(len(entries))])
+    # XLA's reduction over this axis takes twice as long. Slices that keep the axis are half as many
+    # operations to compile.
+    terms = barrier(twice * entries) * flat
+    return reduce(add, [terms[:, k : k + 1] for k in range(flat.shape[1])])[:, 0]
 
 
 class Term(eqx.Module):
@@ -464,7 +465,7 @@ def accumulate(
     q, tracker_to_image = targets(iterate, images)
     wide = 0 if exact is None else exact[:, None]
     derived = _derive(observation, q, tracker_to_image, iterate, images, exact=exact is not None)
-    weights = [(1 / (sd * sd))[:, None] for sd in observation.sigma]
+    weights = unrolled.rows_of((1 / (observation.sigma * observation.sigma))[:, :, None])
     count = len(derived.components)
     term = _weighted_sum([_gauss_newton(derived, k, images) for k in range(count)], weights)
     plain = term
@@ -514,9 +515,8 @@ class ComponentSums(eqx.Module):
 
     def weighted(self, weight: Float[Array, "k batch"]) -> NormalEquations:
         """Gauss-Newton's normal equations with weights 1/s_k^2."""
-        components = range(len(weight))
-        flat = reduce(add, [weight[k] * self.matrix[k] for k in components])
-        gradient = reduce(add, [weight[k] * self.gradient[k] for k in components])
+        flat = reduce(add, unrolled.rows_of(weight[:, None] * self.matrix))
+        gradient = reduce(add, unrolled.rows_of(weight[:, None] * self.gradient))
         cost = jnp.sum(weight * self.squares, axis=0)
         if self.prior is not None:
             away, slope, diagonal = self.prior
@@ -545,6 +545,7 @@ def component_sums(
     """
     q, tracker_to_image = targets(iterate, images)
     derived = _derive(observation, q, tracker_to_image, iterate, images, exact=sigma is not None)
+    weight = None if sigma is None else 1 / (sigma * sigma)
     count, unknowns = len(derived.components), iterate.unknowns
     terms = [_gauss_newton(derived, k, images) for k in range(count)]
     planes: Vector = [term.cost for term in terms]
@@ -552,8 +553,8 @@ def component_sums(
     for term in terms:
         matrix, gradient = contributions(q, tracker_to_image, term, derived.unknowns, 0)
         planes += [*gradient, *matrix]
-    if sigma is not None:
-        weights = [(1 / (sd * sd))[:, None] for sd in sigma]
+    if weight is not None:
+        weights = unrolled.rows_of(weight[:, :, None])
         weighted = _weighted_sum(terms, weights)
         bent = _summed([_second_order(derived, k, images) for k in range(count)], weights)
         # The second derivatives of q itself follow from the weighted gradient.
@@ -563,10 +564,10 @@ def component_sums(
     squares, sums = sums[:count], sums[count:]
     parts = [sums[k * each : (k + 1) * each] for k in range(count)]
     gradient = jnp.stack([unrolled.as_array(part[:unknowns]) for part in parts])
-    if sigma is None:
+    if weight is None:
         rest = [jnp.zeros_like(squares[0])] * len(pairs(unknowns))
     else:
-        pose_gradient = jnp.sum((1 / sigma**2)[:, None] * gradient[:, :6], axis=0)
+        pose_gradient = jnp.sum(weight[:, None] * gradient[:, :6], axis=0)
         rest = complete_curvature(sums[count * each :], unrolled.rows_of(pose_gradient), unknowns)
     known = None
     if medium is not None:

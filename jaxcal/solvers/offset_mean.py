@@ -133,7 +133,7 @@ def influences(
     q, tracker_to_image = targets(iterate, images)
 
     def moved(by: Float[Array, "q batch"]) -> Vector:
-        rows = [row[:, None] for row in by]
+        rows = unrolled.rows_of(by[:, :, None])
         turn = unrolled.apply(unrolled.cross(q), rows[3:6])
         shift = unrolled.apply(tracker_to_image, rows[6:RIGID_UNKNOWNS])
         rigid = [unrolled.add(-v, w, d) for v, w, d in zip(rows[:3], turn, shift, strict=True)]
