@@ -107,8 +107,7 @@ def traces(
     rows, columns = np.triu_indices(unknowns_of(flat))
     twice = np.where(rows == columns, 1, 2).astype(matrix.dtype)[:, None]
     entries = picked(matrix.reshape(-1, matrix.shape[-1]), len(matrix) * rows + columns)
-    # XLA's reduction over this axis takes twice as long. Slices that keep the axis are half as many
-    # operations to compile.
+    # XLA's reduction over this axis takes twice as long. Slices that keep it need no reshaping.
     terms = barrier(twice * entries) * flat
     return reduce(add, [terms[:, k : k + 1] for k in range(flat.shape[1])])[:, 0]
 
