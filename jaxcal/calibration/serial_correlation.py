@@ -76,7 +76,7 @@ ROUNDING_MM = 1e-9
 NEGLIGIBLE = 0.01
 """Errors with less than this share of the variance that they are given tell of no correlation."""
 
-LARGE = 10_000.0
+PRIOR_VARIANCE = 10_000.0
 """Mean of the exponential prior of a variance, relative to the one under independence. The fit
 absorbs nearly all of smooth errors that last longer than the recording, so that they may have any
 size, and the mean of the variances would be that of the least likely model."""
@@ -280,7 +280,7 @@ def _factors(
                 continue
             cost = _restricted_cost(others + weighed[k] / variance[k][:, None, None])
             twice = cost + count * np.log(variance[k]) + log_det
-            twice += 2 * variance[k] / (LARGE * variance[k][0])
+            twice += 2 * variance[k] / (PRIOR_VARIANCE * variance[k][0])
             likelihood = belief * np.exp(-0.5 * (twice - twice.min()))
             weight[k] = likelihood / likelihood.sum()
     return weight * variance / variance[:, :1]
