@@ -242,9 +242,16 @@ def vectors_from_rotations(rotations: Float[np.ndarray, "*n 3 3"]) -> Float[np.n
 
 def inverse_poses(poses: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 4 4"]:
     """The inverses of rigid transforms."""
-    inverse = np.zeros_like(poses)
     rotation = np.swapaxes(poses[..., :3, :3], -1, -2)
-    inverse[..., :3, :3] = rotation
-    inverse[..., :3, 3] = -np.einsum("...ij,...j->...i", rotation, poses[..., :3, 3])
-    inverse[..., 3, 3] = 1.0
-    return inverse
+    translation = -np.einsum("...ij,...j->...i", rotation, poses[..., :3, 3])
+    return matrices_from_rotations(rotation, translation)
+
+
+def matrices_from_rotations(
+    rotations: Float[np.ndarray, "*batch 3 3"], translations: Float[np.ndarray, "*batch 3"]
+) -> Float[np.ndarray, "*batch 4 4"]:
+    """The 4x4 transforms with the given rotations and translations (mm)."""
+    matrices = np.zeros((*rotations.shape[:-2], 4, 4), rotations.dtype)
+    matrices[..., :3, :3], matrices[..., :3, 3] = rotations, translations
+    matrices[..., 3, 3] = 1.0
+    return matrices

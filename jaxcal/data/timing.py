@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.data.poses import check_poses
+from jaxcal.data.poses import check_poses, matrices_from_rotations
 from jaxcal.runtime.array_types import Bool, Float, Int
 from jaxcal.runtime.given_values import real_array
 from jaxcal.runtime.messages import seconds
@@ -140,10 +140,8 @@ def interpolate_poses(
     first, second = sound[before], sound[before + 1]
     share = (asked - times[before]) / (times[before + 1] - times[before])
     turning = Slerp(times, Rotation.from_matrix(sound[:, :3, :3]))
-    result = np.tile(np.eye(4), (len(asked), 1, 1))
-    result[:, :3, :3] = turning(asked).as_matrix()
-    result[:, :3, 3] = first[:, :3, 3] + share[:, None] * (second[:, :3, 3] - first[:, :3, 3])
-    return result
+    moved = first[:, :3, 3] + share[:, None] * (second[:, :3, 3] - first[:, :3, 3])
+    return matrices_from_rotations(turning(asked).as_matrix(), moved)
 
 
 def interpolation_error(

@@ -70,7 +70,7 @@ def read_transform(
             elements = [root]
         else:
             _check_root(root)
-            elements = [each for place in root.all(_COORDINATES) for each in _transforms(place)]
+            elements = _transforms(root)
         # All are looked at: a file with a damaged transform is not to be trusted.
         stated = [(_matrix(e), _frames(e), _stated_error(e, "Error")) for e in elements]
         pairs = [frames for _, frames, _ in stated]
@@ -98,9 +98,10 @@ def _check_root(root: Element) -> None:
         raise FormatError(f"is not a configuration of PLUS: its root is {quoted(root.tag)}")
 
 
-def _transforms(coordinates: Element) -> list[Element]:
-    """Its transforms; PLUS compares their tag without regard to case."""
-    return [element for element in coordinates.children if element.tag.lower() == "transform"]
+def _transforms(root: Element) -> list[Element]:
+    """A configuration's transforms; PLUS compares their tag without regard to case."""
+    each = (element for place in root.all(_COORDINATES) for element in place.children)
+    return [element for element in each if element.tag.lower() == "transform"]
 
 
 def _between(elements: list[Element], frames: FramePair) -> list[Element]:
@@ -225,12 +226,7 @@ def patched_configuration(
     new = _replaced(content, wanted, matrix, error_mm, date)
     # The notes name lines of the new content, which is what their reader opens.
     root = parse_xml(new)
-    others = [
-        element
-        for place in root.all(_COORDINATES)
-        for element in _transforms(place)
-        if set(_frames(element)) != set(wanted)
-    ]
+    others = [each for each in _transforms(root) if set(_frames(each)) != set(wanted)]
     return new, _stale_scale(others, wanted, matrix) + _other_sources(root, others, wanted)
 
 
@@ -250,7 +246,7 @@ def _replaced(
             f"lines {places[0].line} and {places[1].line}: two {_COORDINATES}; PLUS reads one: put "
             "the transforms together"
         )
-    elements = _transforms(places[0]) if places else []
+    elements = _transforms(root)
     between = _between(elements, wanted)
     _check_other_paths([element for element in elements if element not in between], wanted)
     newline = "\r\n" if b"\r\n" in content else "\n"

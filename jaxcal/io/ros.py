@@ -17,7 +17,12 @@ from typing import Any
 import numpy as np
 
 from jaxcal import FormatError, InputError
-from jaxcal.data.poses import check_poses, quaternions_from_rotations, rotations_from_quaternions
+from jaxcal.data.poses import (
+    check_poses,
+    matrices_from_rotations,
+    quaternions_from_rotations,
+    rotations_from_quaternions,
+)
 from jaxcal.io.lines import text_lines
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.messages import quoted
@@ -167,13 +172,12 @@ def read_ros_yaml(
     missing = [key for key in _KEYS if key not in found]
     if missing:
         raise FormatError(f"{name}: {', '.join(missing)} missing: not a transform of easy_handeye")
-    matrix = np.eye(4)
+    numbers = np.array([[found[key] for key in _KEYS]])
     try:
-        quaternion = np.array([[found[key] for key in _KEYS[3:]]])
-        matrix[:3, :3] = rotations_from_quaternions(quaternion, "xyzw")[0]
+        rotations = rotations_from_quaternions(numbers[:, 3:], "xyzw")
     except InputError as error:
         raise FormatError(f"{name}: {error}") from None
-    matrix[:3, 3] = [1e3 * found[key] for key in _KEYS[:3]]
+    matrix = matrices_from_rotations(rotations, 1e3 * numbers[:, :3])[0]
     far = float(np.linalg.norm(matrix[:3, 3])) / 1e3
     if far > _FARTHEST_M:
         raise FormatError(

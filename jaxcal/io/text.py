@@ -18,6 +18,7 @@ from jaxcal.data.names import LengthUnit, PointUnit, QuaternionOrder
 from jaxcal.data.poses import (
     check_poses,
     inverse_poses,
+    matrices_from_rotations,
     rotations_from_quaternions,
 )
 from jaxcal.data.recording import MINIMUM_IMAGES, Recording, make_images
@@ -37,25 +38,9 @@ _MOST_NAMED = 20
 
 _MISSING = frozenset(("", "nan", "inf", "infinity", "na", "n/a", "null", "none"))
 _TRUE = frozenset(("1", "1.0", "true", "yes", "ok", "valid", "good", "tracked"))
-_FALSE = frozenset(
-    (
-        "0",
-        "0.0",
-        "false",
-        "no",
-        "invalid",
-        "missing",
-        "bad",
-        "lost",
-        "out_of_view",
-        "out of view",
-        "out_of_volume",
-        "partially out of volume",
-        "too few markers",
-        "req_timeout",
-        "",
-    )
-)
+_FALSE = {"", "0", "0.0", "false", "no", "invalid", "missing", "bad", "lost"}
+_FALSE |= {"out_of_view", "out of view", "out_of_volume", "partially out of volume"}
+_FALSE |= {"too few markers", "req_timeout"}
 
 
 @dataclass(frozen=True)
@@ -119,13 +104,13 @@ class PoseTable:
         said = []
         if self.not_read:
             columns = ", ".join(map(quoted, self.not_read))
-            said = [f"{self.name}: columns that are not read: {columns}"]
-        if not self.skipped:
-            return said
-        rows = counted(len(self.skipped), "invalid row")
-        numbers = ", ".join(map(str, self.skipped[:_MOST_NAMED]))
-        more = ", ..." if len(self.skipped) > _MOST_NAMED else ""
-        return [*said, f"{self.name}: {rows} left out ({numbers}{more}, counted from 0)"]
+            said.append(f"{self.name}: columns that are not read: {columns}")
+        if self.skipped:
+            rows = counted(len(self.skipped), "invalid row")
+            numbers = ", ".join(map(str, self.skipped[:_MOST_NAMED]))
+            more = ", ..." if len(self.skipped) > _MOST_NAMED else ""
+            said.append(f"{self.name}: {rows} left out ({numbers}{more}, counted from 0)")
+        return said
 
 
 def read_pose_table(
@@ -315,29 +300,22 @@ def read_poses(
     columns = "x y z and a quaternion, a matrix row by row, or 3 rows R t"
     rows = _fixed(table, (7, *MATRIX_WIDTHS), columns, finite=False)
     lines = table.lines
-    if rows.shape[1] != 7:
-        if quaternion is not None:
-            raise FormatError(f"{table.name}: its poses are matrices: leave --quaternion out")
-        poses, lines = _stacked(table, rows)
-        poses[:, :3, 3] *= LENGTHS_MM[pose_units]
-    else:
-        if quaternion is None:
-            raise _order_unknown(table)
-        poses = np.tile(np.eye(4), (len(rows), 1, 1))
-        with naming(path):
-            try:
-                poses[:, :3, :3] = rotations_from_quaternions(
-                    rows[:, 3:], quaternion, labels=_labels(table.lines)
-                )
-            except InputError as error:
-                raise FormatError(str(error)) from None
-        poses[:, :3, 3] = rows[:, :3] * LENGTHS_MM[pose_units]
-    if not invert_poses:
-        return poses
-    # The inverse of what is no pose may look like one.
     with naming(path):
         try:
-            return inverse_poses(check_poses(poses, labels=_labels(lines)))
+            if rows.shape[1] != 7:
+                if quaternion is not None:
+                    raise FormatError("its poses are matrices: leave --quaternion out")
+                poses, lines = _stacked(table, rows)
+            elif quaternion is None:
+                raise _order_unknown(table)
+            else:
+                turns = rotations_from_quaternions(rows[:, 3:], quaternion, labels=_labels(lines))
+                poses = matrices_from_rotations(turns, rows[:, :3])
+            poses[:, :3, 3] *= LENGTHS_MM[pose_units]
+            if invert_poses:
+                # The inverse of what is no pose may look like one.
+                poses = inverse_poses(check_poses(poses, labels=_labels(lines)))
+            return poses
         except InputError as error:
             raise FormatError(str(error)) from None
 
@@ -523,11 +501,9 @@ def _poses(
         return check_poses(matrices, labels=labels)
     if columns.translation is None or columns.quaternion is None:
         return None
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3, 3] = table.numbers(columns.translation, rows) * factor
     quaternions = table.numbers(columns.quaternion, rows)
-    poses[:, :3, :3] = rotations_from_quaternions(quaternions, "xyzw", labels=labels)
-    return poses
+    turns = rotations_from_quaternions(quaternions, "xyzw", labels=labels)
+    return matrices_from_rotations(turns, table.numbers(columns.translation, rows) * factor)
 
 
 def _agreed(asked: PointUnit | None, stated: str | None) -> str:

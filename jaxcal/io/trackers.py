@@ -18,7 +18,7 @@ import numpy as np
 
 from jaxcal import FormatError
 from jaxcal.data.names import LengthUnit
-from jaxcal.data.poses import rotations_from_quaternions
+from jaxcal.data.poses import matrices_from_rotations, rotations_from_quaternions
 from jaxcal.io.frame_names import FramePair
 from jaxcal.io.given_files import naming
 from jaxcal.io.lines import cells_of, text_lines
@@ -123,12 +123,10 @@ def _read_rows(
     for tool, found in poses.items():
         values = np.array(found)
         good = ~np.isnan(values[:, 0])
-        matrices = np.full((len(time), 4, 4), np.nan)
-        matrices[good] = np.eye(4)
         values[~good, :4] = 0.0, 0.0, 0.0, 1.0
         rotations = rotations_from_quaternions(values[:, :4], "xyzw", labels=labels)
-        matrices[good, :3, :3] = rotations[good]
-        matrices[good, :3, 3] = values[good, 4:]
+        matrices = matrices_from_rotations(rotations, values[:, 4:])
+        matrices[~good] = np.nan
         transforms[tool, TRACKER], valid[tool, TRACKER] = matrices, good
     no_images = np.zeros(len(time), bool)
     return TrackedSequence(

@@ -6,7 +6,7 @@ import os
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -55,23 +55,35 @@ def from_sequence(
     placed = None if points is None else _points(points, sequence, options).of(used)
     posed = _posed(sequence, tracking, placed, used, options)
     sequence, spacing = posed.sequence, pixel_size(posed.sequence, options)
+    notes += posed.notes
     with naming_pose_units(options, sequence.length_stated):
         if placed is None or points is None:
-            seen = _searched(posed, spacing, options)
+            results = posed.results
+            if results is None:
+                results = search_target(sequence, posed.valid, used, options)
+            else:
+                results = results.of_tracked(posed.valid)
+            seen = _found_points(sequence, results, options.minimum)
+            notes += fixed_mark(seen.points, posed.poses[seen.rows])
+            notes += tail_of_echoes(results, spacing)
+            given, what, where = results.asked, "frames", sequence.source
         else:
-            seen = _placed(posed, placed, points)
-        images, of_times = _images_of(posed, seen.used, spacing, seen.where, options)
-    notes += [*posed.notes, *seen.notes, *seen.used.notes, *of_times]
+            results, seen = None, _usable_points(sequence, placed, posed.valid)
+            notes += placed.notes + mirrored(sequence, points)
+            given, what = len(placed.rows), "points"
+            where = f"{sequence.source} with {os.fspath(points)}"
+        images, of_times = _images_of(posed, seen, spacing, where, options)
+    notes += [*seen.notes, *of_times]
     if images.kind == "pixel":
         notes += other_pixel_size(sequence, spacing)
-    most_lost = len(images) < seen.given / 2
+    most_lost = len(images) < given / 2
     if most_lost:
-        notes.insert(0, f"only {len(images)} of {seen.given} {seen.what} can be used: see below")
+        notes.insert(0, f"only {len(images)} of {given} {what} can be used: see below")
     # A table of poses does not name their frames.
     named = options.poses is None or kind_of(options.poses) != "table"
     frames = posed.frames if named else None
     recording = Recording(images, source=sequence.source, pose_frames=frames)
-    return Imported(recording, notes, seen.results, most_lost)
+    return Imported(recording, notes, results, most_lost)
 
 
 class _Posed(NamedTuple):
@@ -81,7 +93,6 @@ class _Posed(NamedTuple):
         sequence: of n frames.
         poses: (n, 4, 4) probe -> tracker, mm.
         valid: (n,) True for the selected frames whose pose can be used.
-        selected: (n,) True for the frames that were asked for.
         frames: between which the poses lead.
         track: how the probe moved between the frames; None where that is not known.
         lag_s: by how much images lag behind these poses.
@@ -93,7 +104,6 @@ class _Posed(NamedTuple):
     sequence: TrackedSequence
     poses: Float[np.ndarray, "n 4 4"]
     valid: Bool[np.ndarray, " n"]
-    selected: Bool[np.ndarray, " n"]
     frames: FramePair
     track: PoseTrack | None
     lag_s: float
@@ -127,49 +137,7 @@ def _posed(
         with suppress(InputError):
             track = PoseTrack.of(own)
     by_time = tracking is not None
-    usable = valid & used
-    return _Posed(sequence, poses, usable, used, frames, track, lag_s, by_time, results, notes)
-
-
-class _Seen(NamedTuple):
-    """Where the target was seen.
-
-    Attributes:
-        used: the points of the frames that can be used.
-        given: how many frames or points there were.
-        what: which of the two.
-        where: the files, for messages.
-        notes: what was noticed.
-        results: of all frames, where the target was looked for in them.
-    """
-
-    used: FramePoints
-    given: int
-    what: Literal["frames", "points"]
-    where: str
-    notes: list[str]
-    results: FrameResults | None = None
-
-
-def _searched(posed: _Posed, spacing: tuple[float, float] | None, options: ImportOptions) -> _Seen:
-    """The target as it is found in the frames."""
-    sequence, results = posed.sequence, posed.results
-    if results is None:
-        results = search_target(sequence, posed.valid, posed.selected, options)
-    else:
-        results = results.of_tracked(posed.valid)
-    used = _found_points(sequence, results, options.minimum)
-    notes = fixed_mark(used.points, posed.poses[used.rows]) + tail_of_echoes(results, spacing)
-    return _Seen(used, results.asked, "frames", sequence.source, notes, results)
-
-
-def _placed(posed: _Posed, placed: FramePoints, points: str | os.PathLike[str]) -> _Seen:
-    """The target as another file has it."""
-    sequence = posed.sequence
-    used = _usable_points(sequence, placed, posed.valid)
-    notes = placed.notes + mirrored(sequence, points)
-    where = f"{sequence.source} with {os.fspath(points)}"
-    return _Seen(used, len(placed.rows), "points", where, notes)
+    return _Posed(sequence, poses, valid & used, frames, track, lag_s, by_time, results, notes)
 
 
 def _images_of(

@@ -21,7 +21,6 @@ from jaxcal.io.text import (
     recording_of,
     width_without_header,
 )
-from jaxcal.runtime.array_types import Float
 
 
 def from_tables(sources: Sequence[str | os.PathLike[str]], options: ImportOptions) -> Imported:
@@ -95,15 +94,10 @@ def _from_table(table: PoseTable, notes: list[str], lost: int, options: ImportOp
     if table.time is not None:
         time, said = good_time(table.time, lambda row: f"{table.name}:{table.lines[row]}", options)
         table, notes = replace(table, time=time), notes + said
-        if time is not None and table.velocity is None:
-            table = replace(table, velocity=_velocities(time, table))
+        poses = table.poses
+        if poses is not None and time is not None and len(time) > 1 and table.velocity is None:
+            track = PoseTrack.of_table(time, poses, table.name)
+            table = replace(table, velocity=track.velocities(time))
     with naming_pose_units(options, table.length_stated):
         recording = recording_of(table, options.spacing_mm, options.minimum)
     return Imported(recording, notes, most_lost=len(table) < lost)
-
-
-def _velocities(time: Float[np.ndarray, " n"], table: PoseTable) -> Float[np.ndarray, "n 6"] | None:
-    """How the probe moved, from the poses of neighbouring rows; None where they do not tell."""
-    if table.poses is None or len(time) < 2:
-        return None
-    return PoseTrack.of_table(time, table.poses, table.name).velocities(time)

@@ -111,19 +111,17 @@ def search_target(
     )
     fate[~selected] = NOT_SELECTED
     reason = [""] * count
-    position, covariance = np.full((count, 2), np.nan), np.full((count, 2, 2), np.nan)
-    contrast, margin = np.full(count, np.nan), np.full(count, np.nan)
-    width = np.full((count, 2), np.nan)
+    shapes = {"position": (2,), "covariance": (2, 2), "width": (2,)}
+    shapes |= {"contrast_db": (), "margin_db": ()}
+    measured = {name: np.full((count, *shape), np.nan) for name, shape in shapes.items()}
     rows = np.flatnonzero(fate == NOT_CREDIBLE)
     frames = sequence.images(rows, orientation=options.orientation)
     for row, frame in zip(rows, frames, strict=True):
         with naming(f"{sequence.source}: {sequence.frame_name(int(row))}"):
             located = localise(frame, target, region=options.region)
-        contrast[row], margin[row] = located.contrast_db[0], located.margin_db[0]
         reason[row] = located.reason[0]
         if located.found[0]:
             fate[row] = FOUND
-            position[row], covariance[row] = located.position[0], located.covariance[0]
-            width[row] = located.width[0]
-    found = position, covariance, contrast, margin, width
-    return FrameResults(target, fate, tuple(reason), *found, sequence.files)
+        for name, values in measured.items():
+            values[row] = getattr(located, name)[0]
+    return FrameResults(target, fate, tuple(reason), files=sequence.files, **measured)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Literal
 
@@ -78,8 +78,8 @@ def _poses_of(
     """A pose for each point, whether it has one, the probe's velocities if known, and notes."""
     assert poses.poses is not None
     assert points.points is not None
-    for names in (_file_names, _frame_numbers):
-        named, wanted = names(poses), names(points)
+    of_file = _file_names(poses), _file_names(points)
+    for named, wanted in (of_file, (poses.frame, points.frame)):
         if named is not None and wanted is not None:
             places = _rows_by_image(poses, named)
             rows = np.array([places.get(image, -1) for image in _rows_by_image(points, wanted)])
@@ -123,11 +123,7 @@ def _file_names(table: PoseTable) -> list[str] | None:
     return None if table.file is None else [re.split(r"[/\\]", name)[-1] for name in table.file]
 
 
-def _frame_numbers(table: PoseTable) -> list[int] | None:
-    return None if table.frame is None else table.frame.tolist()
-
-
-def _rows_by_image(table: PoseTable, images: Sequence[object]) -> dict[object, int]:
+def _rows_by_image(table: PoseTable, images: Iterable[object]) -> dict[object, int]:
     """The row of each image."""
     rows: dict[object, int] = {}
     for row, image in enumerate(images):
