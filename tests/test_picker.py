@@ -313,7 +313,7 @@ def test_the_table_goes_on_and_goes_back(tmp_path):
     assert picks.undo() == 0
     other = picks_of(path)
     assert other.points == {0: (1.25, -0.5), 3: (79.5, 59.5)}
-    assert (other.skipped, other.next_frame) == (set(), 1)
+    assert (other.skipped, other.left[0]) == (set(), 1)
     for frame, place in ((2, (1.0, 1.0)), (0, (79.6, 1.0)), (0, (float("nan"), 1.0))):
         with pytest.raises(InputError):
             picks.pick(frame, *place)

@@ -193,14 +193,8 @@ class Problem(OneOrBatch):
 
     def points_only(self) -> Problem:
         """The problem without channels, covariances, bounds, sound speed and delay."""
-        return replace(
-            self,
-            channels=None,
-            covariance=None,
-            max_elevation=None,
-            sound_speed=None,
-            delay=None,
-        )
+        left_out = ("channels", "covariance", "max_elevation", "sound_speed", "delay")
+        return replace(self, **dict.fromkeys(left_out))
 
     @classmethod
     def from_recording(
@@ -236,8 +230,8 @@ class Problem(OneOrBatch):
         jax = jax_in_use()
         put: Any = jax.device_put if jax is not None else lambda array: array
 
-        def array(values: np.ndarray | float) -> Any:
-            return put(np.asarray(values, dtype=dtype))
+        def array(values: np.ndarray | float | None) -> Any:
+            return None if values is None else put(np.asarray(values, dtype=dtype))
 
         channels, warnings = None, ()
         raw = images.measurements if images.kind == "time_of_flight" else images.time_of_flight
@@ -253,22 +247,20 @@ class Problem(OneOrBatch):
             channels = Channels(
                 array(distances), array(accepted.astype(float)), array(probe.element_positions())
             )
-        pixels = images.kind == "pixel"
-        known = not pixels or images.spacing_mm is not None
-        spacing = np.ones(2) if images.spacing_mm is None else np.asarray(images.spacing_mm)
+        pixels, spacing = images.kind == "pixel", images.spacing_mm
         problem = cls(
             poses=array(images.poses),
             measurements=array(images.measurements),
             mask=array(images.mask.astype(float)),
-            spacing=array(spacing),
+            spacing=array(np.ones(2) if spacing is None else spacing),
             face_offset=array(images.face_offset_mm),
-            covariance=None if images.covariance is None else array(images.covariance),
-            max_elevation=None if images.max_elevation is None else array(images.max_elevation),
+            covariance=array(images.covariance),
+            max_elevation=array(images.max_elevation),
             sound_speed=None if probe is None else array(probe.sound_speed_m_s),
             delay=None if probe is None else array(probe.delay_s),
             channels=channels,
             pixels=pixels,
-            spacing_known=known,
+            spacing_known=not pixels or spacing is not None,
             curved=isinstance(probe, CurvilinearProbe),
         )
         return problem, warnings
@@ -484,10 +476,8 @@ def check_shapes(problem: Problem) -> None:
         (channels, "heard", (*shape, *elements), False),
         (channels, "elements", (*batch, *elements, 3), False),
     ):
-        if holder is None:
-            continue
-        value = getattr(holder, name)
-        if value is None and optional:
+        value = getattr(holder, name, None)
+        if holder is None or (value is None and optional):
             continue
         kind = getattr(getattr(value, "dtype", None), "kind", "")
         # bfloat16 and its like are of numpy's kind V.

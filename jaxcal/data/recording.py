@@ -35,6 +35,7 @@ MOST_IMAGES = 100_000
 
 LARGEST = 1e7
 """Largest coordinate accepted, in mm or px, and largest variance of one: ten kilometres."""
+_BEYOND = f"holds a number beyond {LARGEST:g}: that cannot be a measure"
 
 LEAST_SD = 1e-9
 """Least SD accepted in a covariance, in mm or px: no point is known within a picometre."""
@@ -276,12 +277,10 @@ def joined(first: Recording, second: Recording) -> Recording:
 
     velocity = None
     if a.velocity is not None or b.velocity is not None:
-        velocity = np.concatenate(
-            [
-                np.full((len(each), 6), np.nan) if (v := each.velocity) is None else v
-                for each in (a, b)
-            ]
-        )
+        velocity = np.full((len(a) + len(b), 6), np.nan)
+        for each, rows in ((a, slice(len(a))), (b, slice(len(a), None))):
+            if each.velocity is not None:
+                velocity[rows] = each.velocity
     return replace(
         first,
         calibration=replace(
@@ -473,18 +472,12 @@ def used_values(
         _refuse(kind, np.isinf(values).any(axis=1), "holds NaN or Inf")
         return values
     values[~used] = 1.0
-    _refuse(
-        kind,
-        ~np.isfinite(values).all(axis=1),
-        "holds NaN or Inf: mask out images without the target",
-    )
+    lost = ~np.isfinite(values).all(axis=1)
+    _refuse(kind, lost, "holds NaN or Inf: mask out images without the target")
     _check_magnitude(kind, values, used)
     if kind == "point":
-        _refuse(
-            kind,
-            values[:, 1] <= 0,
-            "has a range that is not positive: are lateral position and range exchanged?",
-        )
+        why = "has a range that is not positive: are lateral position and range exchanged?"
+        _refuse(kind, values[:, 1] <= 0, why)
         return values
     above = np.flatnonzero(values[:, 1] < 0)
     if len(above):
@@ -602,8 +595,7 @@ def _raw_times(
 def _check_magnitude(name: str, values: np.ndarray, used: np.ndarray) -> None:
     """Refuse numbers too large in any unit, before they overflow; NaN and Inf are checked later."""
     rows = np.abs(values.reshape(len(used), -1)) if len(used) else np.zeros((0, 1))
-    bad = (np.isfinite(rows) & (rows > LARGEST)).any(axis=1) & used
-    _refuse(name, bad, f"holds a number beyond {LARGEST:g}: that cannot be a measure")
+    _refuse(name, (np.isfinite(rows) & (rows > LARGEST)).any(axis=1) & used, _BEYOND)
 
 
 def _mask(mask: np.ndarray | None, count: int) -> Bool[np.ndarray, " n"]:
@@ -630,8 +622,7 @@ def _velocity(values: np.ndarray | None, count: int) -> Float[np.ndarray, "n 6"]
     if values is None:
         return None
     values = _shaped(values, "velocity", (count, 6))
-    beyond = (np.abs(values) > LARGEST).any(axis=1)
-    _refuse("velocity", beyond, f"holds a number beyond {LARGEST:g}: that cannot be a measure")
+    _refuse("velocity", (np.abs(values) > LARGEST).any(axis=1), _BEYOND)
     return values
 
 

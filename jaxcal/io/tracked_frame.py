@@ -30,7 +30,7 @@ from jaxcal.io.xml import parse_xml
 _HEAD = struct.Struct(">HHH3HIIH64s")
 _UINT8 = 3
 _BRIGHTNESS, _COLOUR = 1, 5
-_ORIENTATIONS = {0: "", 1: "UF", 2: "UF", 3: "UN", 4: "UN", 5: "MF", 6: "MF", 8: "MN", 9: "MN"}
+_ORIENTATIONS = {0: "MF", 1: "UF", 2: "UF", 3: "UN", 4: "UN", 5: "MF", 6: "MF", 8: "MN", 9: "MN"}
 """PLUS's numbers for the orientations of B-mode images; 0 is unknown to PLUS, MF here."""
 _MF = 5
 _MOST_XML = 2**18
@@ -64,9 +64,8 @@ def decode_tracked_frame(content: memoryview) -> TrackedFrame:
         )
     xml = bytes(content[_HEAD.size : _HEAD.size + xml_size])
     pixels = np.frombuffer(content, np.uint8, offset=_HEAD.size + xml_size)
-    stored = _ORIENTATIONS[orientation] or "MF"
-    frame = oriented(grey_of(pixels.reshape(rows, columns, components)), stored)
-    frame = np.ascontiguousarray(frame)
+    frame = grey_of(pixels.reshape(rows, columns, components))
+    frame = np.ascontiguousarray(oriented(frame, _ORIENTATIONS[orientation]))
     frame.setflags(write=False)
     return TrackedFrame(Picture(frame, (1.0, 1.0)), _transforms(xml.rstrip(b"\0")))
 
@@ -104,11 +103,11 @@ def _transforms(xml: bytes) -> tuple[Tracked, ...]:
         for field in root.all("FrameField")
     }
     found = []
-    for name, text in fields.items():
-        if not name.endswith(_TRANSFORM) or split_name(name.removesuffix(_TRANSFORM)) is None:
+    for field, text in fields.items():
+        name = field.removesuffix(_TRANSFORM)
+        if name == field or split_name(name) is None:
             continue
-        status = fields.get(name.removesuffix(_TRANSFORM) + _STATUS, "")
-        found.append(Tracked(name.removesuffix(_TRANSFORM), _matrix(text.split()), status))
+        found.append(Tracked(name, _matrix(text.split()), fields.get(name + _STATUS, "")))
         if len(found) > _MOST_TRANSFORMS:
             raise ContentError(f"a tracked frame with more than {_MOST_TRANSFORMS} transforms")
     return tuple(found)

@@ -7,7 +7,7 @@ times of flight in seconds are refused, and their row is named.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, get_args
 
 import jax
@@ -198,7 +198,10 @@ def segment(
 
     out_of_plane = None
     if method == "shortest":
-        points, covariance, noise, rejected = _shortest(distances, probe, interpolate)
+        line, least = shortest(distances, pitch_mm=probe.pitch_mm if interpolate else None)
+        points = probe.image_to_cartesian(np.asarray(line), np.asarray(least))
+        covariance, noise = None, np.full(len(points), np.nan)
+        rejected = np.zeros(len(points), int)
     else:
         points, covariance, noise, rejected, full = _fit(distances, probe, robust, scale, failed)
         failed |= used & (2 * rejected > lines)
@@ -372,14 +375,6 @@ def _end_of_window(
     return equal & cut[:, None]
 
 
-def _shortest(
-    distances: np.ndarray, probe: Probe, interpolate: bool
-) -> tuple[np.ndarray, None, np.ndarray, np.ndarray]:
-    line, least = shortest(distances, pitch_mm=probe.pitch_mm if interpolate else None)
-    points = probe.image_to_cartesian(np.asarray(line), np.asarray(least))
-    return points, None, np.full(len(points), np.nan), np.zeros(len(points), int)
-
-
 def _fit(distances: np.ndarray, probe: Probe, robust: bool, scale: NoiseScale, failed: np.ndarray):
     """Points, covariances, noise, rejected lines; for curved arrays [x, z, y^2] with covariance."""
     curved = isinstance(probe, CurvilinearProbe)
@@ -433,10 +428,7 @@ def compiled_fit(curved: bool, robust: bool):
     The compiler flags for batches let sums over the elements vectorise. NaN and Inf become weights
     of zero before any arithmetic.
     """
-
-    def fit(distances: AnyArray, positions: AnyArray) -> Fits:
-        return fit_frames(distances, positions, (curved, robust))
-
+    fit = partial(fit_frames, how=(curved, robust))
     return jax.jit(fit, compiler_options=fast_to_run(jax.default_backend()))
 
 

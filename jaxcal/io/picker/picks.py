@@ -20,8 +20,6 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
 from jaxcal import FormatError, InputError, OutputError
 from jaxcal.io.atomic import write_text
 from jaxcal.io.given_files import read_bytes
@@ -70,6 +68,7 @@ class Picks:
         orientation: str | None = None,
     ) -> None:
         self.files = tuple(files)
+        self._column = "file" if files else "frame"
         self.path, self.shown, self.size = os.fspath(path), list(shown), size
         for each in files:
             if re.search(_UNTOLD, each):
@@ -89,11 +88,6 @@ class Picks:
             self._load(self._known.decode(errors="replace"), count)
 
     @property
-    def next_frame(self) -> int | None:
-        """The first frame that was neither picked nor skipped; None where there is none."""
-        return next(iter(self.left), None)
-
-    @property
     def left(self) -> list[int]:
         """Frames to place points in that were neither picked nor skipped."""
         return [k for k in self.shown if k not in self.points and k not in self.skipped]
@@ -106,9 +100,8 @@ class Picks:
             OutputError: the table cannot be written, or another program has changed it; nothing has
                 changed.
         """
-        if not (
-            np.isfinite([u, v]).all() and _inside(u, self.size[0]) and _inside(v, self.size[1])
-        ):
+        # Pixel centres lie at integers, so that a frame begins at -1/2.
+        if not all(-0.5 <= x <= size - 0.5 for x, size in zip((u, v), self.size, strict=True)):
             raise InputError(f"({u}, {v}) is not in the frame")
         self._change(frame, (float(u), float(v)), False)
 
@@ -148,8 +141,7 @@ class Picks:
         others = {k for k in self.skipped if k != frame} | ({frame} if skipped else set())
         rows = [f"{self._named(k)},{points[k][0]!r},{points[k][1]!r}" for k in sorted(points)]
         told = " ".join(map(self._named, sorted(others)))
-        column = "file" if self.files else "frame"
-        head = [self._head, f"{_SKIPPED} {told}".rstrip(), f"{column},u,v"]
+        head = [self._head, f"{_SKIPPED} {told}".rstrip(), f"{self._column},u,v"]
         # Points that a second page or an editor has put there must not be lost.
         if self._content() not in (self._known, None):
             raise OutputError(
@@ -192,8 +184,7 @@ class Picks:
             table = read_pose_table(self.path)
             frames = table.file if self.files else table.frame
             if frames is None or table.points is None:
-                column = "file" if self.files else "frame"
-                raise FormatError(f"{self.path}: has no columns {column}, u and v")
+                raise FormatError(f"{self.path}: has no columns {self._column}, u and v")
             if self.files:
                 places = {name: k for k, name in enumerate(self.files)}
                 frames = [places.get(str(name), count) for name in frames]
@@ -203,8 +194,3 @@ class Picks:
             }
         if any(frame >= count for frame in [*self.points, *self.skipped]):
             raise FormatError(f"{self.path}: names a frame that the sequence has not")
-
-
-def _inside(place: float, size: int) -> bool:
-    """Pixel centres lie at integers, so that a frame begins at -1/2."""
-    return -0.5 <= place <= size - 0.5

@@ -107,7 +107,7 @@ class Picker:
             "files": [picks.files[frame] for frame in picks.shown] if picks.files else [],
             "points": {str(frame): point for frame, point in picks.points.items()},
             "skipped": sorted(picks.skipped),
-            "next": picks.next_frame,
+            "next": next(iter(picks.left), None),
         }
 
     def do(self, what: str, asked: dict[str, Any]) -> dict[str, Any]:
