@@ -45,12 +45,6 @@ from jaxcal.runtime.jax_modes import importing_jax, in_own_modes
 from jaxcal.runtime.messages import counted, shown
 from jaxcal.runtime.one_or_batch import OneOrBatch
 
-_HOW = (
-    "jaxcal.Problem.from_arrays(poses, measurements) makes one of arrays, jaxcal.load(path) reads "
-    "a recording"
-)
-
-
 _ROUNDING = 1e-4
 """Rotations in 32 bits are orthogonal to this."""
 
@@ -426,8 +420,11 @@ def as_problem(value: Any, name: str, *, channels: bool = True) -> Problem:
         raise InputError(
             f"{name} takes one problem, not {len(value)}: jaxcal.calibrate_batch takes a list"
         )
-    kind = "a dictionary" if isinstance(value, dict) else f"{type(value).__name__}"
-    raise InputError(f"{name} takes a problem or a recording, not {kind}: {_HOW}")
+    kind = "a dictionary" if isinstance(value, dict) else type(value).__name__
+    raise InputError(
+        f"{name} takes a problem or a recording, not {kind}: jaxcal.Problem.from_arrays(poses, "
+        "measurements) makes one of arrays, jaxcal.load(path) reads a recording"
+    )
 
 
 def as_batch(value: Any, name: str, *, channels: bool = True) -> Problem:

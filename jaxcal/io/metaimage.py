@@ -37,8 +37,8 @@ _LOCAL = ("LOCAL", "Local", "local")
 """Names of the file of the pixels that MetaIO takes for the header's own."""
 
 
-def read_metaimage(path: Path, name: str) -> TrackedSequence:
-    """Read a header; its errors do not name the file."""
+def read_metaimage(path: Path) -> TrackedSequence:
+    """Read a header; neither its errors nor the sequence name the file."""
     header = SequenceHeader()
     for line, text, end in header_lines(path):
         key, separator, value = text.partition("=")
@@ -62,7 +62,7 @@ def read_metaimage(path: Path, name: str) -> TrackedSequence:
     # Tracking alone has three forms: 0 0 N with either type, or 1 1 N with a dummy pixel a frame.
     if kind != "MET_OTHER" and columns > 1 and rows > 1:
         pixels = _metaimage_pixels(path, header, columns, rows, count)
-    return sequence_of(header, count, pixels, "ImageStatus", name)
+    return sequence_of(header, count, pixels, "ImageStatus")
 
 
 def _metaimage_size(fields: dict[str, str]) -> tuple[int, int, int]:

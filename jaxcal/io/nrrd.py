@@ -38,8 +38,8 @@ _NRRD_TYPES = {
 _DTYPES = {name: np.dtype(dtype) for dtype, names in _NRRD_TYPES.items() for name in names}
 
 
-def read_nrrd(path: Path, name: str) -> TrackedSequence:
-    """Read a header; its errors do not name the file."""
+def read_nrrd(path: Path) -> TrackedSequence:
+    """Read a header; neither its errors nor the sequence name the file."""
     header = SequenceHeader()
     for line, text, end in header_lines(path):
         if line == 1:
@@ -70,7 +70,7 @@ def read_nrrd(path: Path, name: str) -> TrackedSequence:
     pixels = None
     if columns > 1 and rows > 1:
         pixels = _nrrd_pixels(path, header, (columns, rows, channels), count)
-    found = sequence_of(header, count, pixels, "Status", name)
+    found = sequence_of(header, count, pixels, "Status")
     if not np.isfinite(found.time).any() and (time := _index_times(fields, count)) is not None:
         return replace(found, time=time)
     return found

@@ -88,8 +88,8 @@ def read_transform(
             matrix, _, error_mm = stated[index]
             total = (np.linalg.inv(check_affine(matrix)) if inverted else matrix) @ total
         if of_result:
-            errors = root.first("ErrorReport/ReprojectionError3DStatistics")
-            error_mm = _stated_error(errors, "CalibrationMeanMm")
+            errors = root.all("ErrorReport/ReprojectionError3DStatistics")
+            error_mm = _stated_error(next(errors, None), "CalibrationMeanMm")
         return PlusTransform(total, error_mm if len(way) == 1 else None, wanted[1])
 
 

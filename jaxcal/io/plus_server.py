@@ -74,14 +74,13 @@ def update_transform(
     try:
         with socket.create_connection((host, port), _TIMEOUT_S) as link:
             link.sendall(encode_header(1, message, body) + body)
-            reply = _reply(link, f"ACK_{number}", due)
+            return _understood(_reply(link, f"ACK_{number}", due))
     except TimeoutError:
         raise InputError(f"{where}: no reply within {_TIMEOUT_S:g} s") from None
     except (OSError, UnicodeError) as error:
         raise InputError(f"{where}: {one_line(error)}") from None
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
-    return _understood(reply, where)
 
 
 def _reply(link: socket.socket, device: str, due: float) -> bytes:
@@ -119,13 +118,13 @@ def _take(link: socket.socket, count: int, due: float) -> bytes:
     return b"".join(parts)
 
 
-def _understood(body: bytes, where: str) -> str:
+def _understood(body: bytes) -> str:
     try:
         _, length = _STRING.unpack_from(body)
         root = parse_xml(body[_STRING.size : _STRING.size + length].rstrip(b"\0"))
     except (struct.error, FormatError):
-        raise InputError(f"{where}: its reply is not understood") from None
+        raise InputError("its reply is not understood") from None
     said = root.attributes.get("Message", "")
     if root.attributes.get("Status", "").upper() != "SUCCESS":
-        raise InputError(f"{where}: refuses the transform: {quoted(said, 200)}")
+        raise InputError(f"refuses the transform: {quoted(said, 200)}")
     return said

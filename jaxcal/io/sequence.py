@@ -153,11 +153,6 @@ class TrackedSequence:
         """Numbers by which other files name the frames, -1 for a frame without one."""
         return np.arange(len(self)) if self.numbers is None else self.numbers
 
-    def numbers_of(self, rows: Int[np.ndarray, " m"]) -> Int[np.ndarray, " m"] | None:
-        """Numbers by which other files name these frames; None if one of them has none."""
-        numbers = self.all_numbers[rows]
-        return numbers if (numbers >= 0).all() else None
-
     def rows_of(
         self, numbers: Int[np.ndarray, " m"], labels: Sequence[str]
     ) -> Int[np.ndarray, " m"]:

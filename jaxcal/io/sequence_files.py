@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -34,10 +35,9 @@ def read_sequence(path: str | os.PathLike[str]) -> TrackedSequence:
     """
     check_readable(path)
     name = os.fspath(path)
+    read = read_nrrd if name.lower().endswith((".nrrd", ".nhdr")) else read_metaimage
     with naming(path):
-        if name.lower().endswith((".nrrd", ".nhdr")):
-            return read_nrrd(Path(path), name)
-        return read_metaimage(Path(path), name)
+        return replace(read(Path(path)), source=name)
 
 
 def write_sequence(

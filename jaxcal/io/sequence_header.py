@@ -171,7 +171,7 @@ def orientation_and_kind(text: str, kind: str) -> tuple[Orientation | None, str]
 
 
 def sequence_of(
-    header: SequenceHeader, count: int, pixels: Pixels | None, image_status: str, name: str
+    header: SequenceHeader, count: int, pixels: Pixels | None, image_status: str
 ) -> TrackedSequence:
     """The sequence of a header; ``image_status`` is how the format names that field."""
     transforms: dict[FramePair, np.ndarray] = {}
@@ -204,15 +204,8 @@ def sequence_of(
                 what = f"line {line}: a transform with status OK"
                 transforms[pair][number] = finite_numbers(value, 16, what).reshape(4, 4)
                 valid[pair][number] = True
-    return TrackedSequence(
-        transforms,
-        valid,
-        time,
-        image_valid,
-        pixels,
-        name,
-        without_status=tuple(without_status),
-    )
+    lacking = tuple(without_status)
+    return TrackedSequence(transforms, valid, time, image_valid, pixels, without_status=lacking)
 
 
 def check_written(transforms: Mapping[FramePair, np.ndarray], time: np.ndarray) -> None:

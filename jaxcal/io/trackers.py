@@ -59,15 +59,15 @@ def read_tracker(
         FormatError: neither of the two, a row that cannot be read, or another unit than the file
             states; file and line are named.
     """
-    name = os.fspath(path)
     rows = ((line, cells_of(f"line {line}", content)) for line, content in text_lines(path))
     with naming(path):
         line, first = next(rows, (1, [""]))
         if first[0].strip() == "Tools":
-            found = _read_ndi(line, [cell.strip() for cell in first], rows, name)
-            return found.scaled(pose_units or "mm")
+            found = _read_ndi(line, [cell.strip() for cell in first], rows)
+            return replace(found.scaled(pose_units or "mm"), source=os.fspath(path))
         if first[0].strip() == "Format Version":
-            return replace(_read_motive(first, rows, name, pose_units), length_stated=True)
+            found = _read_motive(first, rows, pose_units)
+            return replace(found, source=os.fspath(path), length_stated=True)
         raise FormatError(
             "is no export of NDI ToolBox or Motive with commas between cells: if a spreadsheet "
             "program saved it, import the original file of the tracker's program"
@@ -88,7 +88,7 @@ Rows = Iterator[tuple[int, list[str]]]
 
 
 def _read_rows(
-    rows: Rows, tools: dict[str, _Tool], stamp: int | None, counters: list[int], name: str
+    rows: Rows, tools: dict[str, _Tool], stamp: int | None, counters: list[int]
 ) -> TrackedSequence:
     """The poses of all tools, in the file's unit, with times from the column ``stamp``.
 
@@ -129,9 +129,7 @@ def _read_rows(
         matrices[~good] = np.nan
         transforms[tool, TRACKER], valid[tool, TRACKER] = matrices, good
     no_images = np.zeros(len(time), bool)
-    return TrackedSequence(
-        transforms, valid, np.array(time), no_images, source=name, numbers=np.array(numbers)
-    )
+    return TrackedSequence(transforms, valid, np.array(time), no_images, numbers=np.array(numbers))
 
 
 def _cell(cells: list[str], column: int) -> str:
@@ -161,7 +159,7 @@ def _frame_number(cells: list[str], columns: list[int]) -> int:
     return int(text) if re.fullmatch(r"\d{1,18}", text) else -1
 
 
-def _read_ndi(line: int, header: list[str], rows: Rows, name: str) -> TrackedSequence:
+def _read_ndi(line: int, header: list[str], rows: Rows) -> TrackedSequence:
     """NDI ToolBox: one row a frame; a group of columns a tool, which begins with "Port ..."."""
     starts = [index for index, cell in enumerate(header) if cell.startswith("Port")]
     if not starts:
@@ -186,7 +184,7 @@ def _read_ndi(line: int, header: list[str], rows: Rows, name: str) -> TrackedSeq
     stamps = [index for index, cell in enumerate(header) if cell == "Time [sec]"]
     stamp = first.get("Time [sec]", next(iter(stamps), None))
     counters = [tool.counter for tool in tools.values() if tool.counter is not None]
-    return _read_rows(rows, tools, stamp, counters, name)
+    return _read_rows(rows, tools, stamp, counters)
 
 
 def _tool_name(cell: str, taken: set[str]) -> str:
@@ -197,9 +195,7 @@ def _tool_name(cell: str, taken: set[str]) -> str:
     return name if name not in taken else cell.strip()
 
 
-def _read_motive(
-    first: list[str], rows: Rows, name: str, pose_units: LengthUnit | None
-) -> TrackedSequence:
+def _read_motive(first: list[str], rows: Rows, pose_units: LengthUnit | None) -> TrackedSequence:
     """Motive: key,value pairs; rows Type, Name, ID, Parent; what a column is; its axis; data."""
     # Not by pairs of cells: the take's name may have commas.
     stated = dict(itertools.pairwise(cell.strip() for cell in first))
@@ -228,7 +224,7 @@ def _read_motive(
             stamps = [index for index, cell in enumerate(cells) if cell.startswith("Time (")]
             counters = [index for index, cell in enumerate(cells) if cell == "Frame"]
             stamp = next(iter(stamps), None)
-            return _read_rows(rows, tools, stamp, counters, name).scaled(_UNITS[unit])
+            return _read_rows(rows, tools, stamp, counters).scaled(_UNITS[unit])
         elif "Rotation" in cells or "Position" in cells:
             what = cells
     raise FormatError("has no row that begins with Frame: not a whole export of Motive")

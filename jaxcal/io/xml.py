@@ -56,10 +56,6 @@ class Element:
             if child.tag == tag:
                 yield from child.all(rest) if rest else (child,)
 
-    def first(self, path: str) -> Element | None:
-        """The first element at a path, or None."""
-        return next(self.all(path), None)
-
 
 def read_xml(path: str | os.PathLike[str]) -> tuple[Element, bytes]:
     """The root element of a file, and the file's bytes.

@@ -158,13 +158,11 @@ def _without_pose(
     lost = asked[~between]
     outside = int(((lost < track.time[0]) | (lost > track.time[-1])).sum())
     # With every pose as if it could be used, those beside one that cannot be are not lost.
-    near = can_interpolate(track.time, lost, max_gap_s=track.gap_s)
-    beside = int(near.sum())
-    gaps = len(lost) - outside - beside
+    beside = int(can_interpolate(track.time, lost, max_gap_s=track.gap_s).sum())
     reasons = {
         "outside the time of the poses": outside,
         "beside a pose whose tracking was not OK": beside,
-        f"between poses more than {track.gap_s:.3g} s apart": gaps,
+        f"between poses more than {track.gap_s:.3g} s apart": len(lost) - outside - beside,
     }
     said = ", ".join(f"{count} {reason}" for reason, count in reasons.items() if count)
     return f"{len(lost)} of {len(asked)} images have no pose at their time: {said}"

@@ -165,6 +165,7 @@ def _images_of(
         notes += said
     pixels = sequence.pixels
     size = None if pixels is None else (pixels.columns, pixels.rows)
+    numbers = sequence.all_numbers[used.rows]
     images = make_images(
         posed.poses[used.rows],
         used.points,
@@ -173,7 +174,7 @@ def _images_of(
         time=time,
         velocity=velocity,
         spacing_mm=spacing,
-        frame=sequence.numbers_of(used.rows),
+        frame=numbers if (numbers >= 0).all() else None,
         frame_size=size if used.kind == "pixel" else None,
         minimum=options.minimum,
         where=where,
