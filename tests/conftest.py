@@ -86,6 +86,7 @@ import numpy as np
 import pytest
 from _pytest.runner import runtestprotocol
 from held_up import HeldUp
+from scipy.spatial.transform import Rotation
 
 import jaxcal
 from jaxcal.data.poses import rotation_angle
@@ -198,6 +199,15 @@ def compiled_programs() -> Iterator[list[str]]:
         yield compiled
     finally:
         jax.monitoring.unregister_event_duration_listener(listen)
+
+
+def random_poses(count: int, seed: int | np.random.Generator = 0) -> np.ndarray:
+    """Poses turned in all directions, up to 200 mm from the origin along each axis."""
+    rng = np.random.default_rng(seed)
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, :3] = Rotation.random(count, random_state=seed).as_matrix()
+    poses[:, :3, 3] = rng.uniform(-200, 200, (count, 3))
+    return poses
 
 
 def angle(first: np.ndarray, second: np.ndarray) -> float:

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import random_poses
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -11,14 +12,6 @@ from scipy.spatial.transform import Rotation
 from jaxcal import InputError
 from jaxcal.data.geometry import rotation_from_vector
 from jaxcal.data.poses import check_poses, nearest_rotations, rotation_angle
-
-
-def random_poses(seed: int, count: int = 5) -> np.ndarray:
-    rng = np.random.default_rng(seed)
-    poses = np.tile(np.eye(4), (count, 1, 1))
-    poses[:, :3, :3] = nearest_rotations(rng.normal(size=(count, 3, 3)))[0]
-    poses[:, :3, 3] = rng.normal(size=(count, 3)) * 100
-    return poses
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -30,12 +23,12 @@ def test_nearest_rotation_is_a_rotation_and_no_other_is_nearer(seed):
     identity = np.tile(np.eye(3), (4, 1, 1))
     np.testing.assert_allclose(rotations @ rotations.swapaxes(1, 2), identity, atol=1e-12)
     np.testing.assert_allclose(np.linalg.det(rotations), 1, atol=1e-12)
-    others = random_poses(seed, 4)[:, :3, :3]
+    others = random_poses(4, seed)[:, :3, :3]
     assert (np.linalg.norm(others - matrices, axis=(1, 2)) >= distance - 1e-12).all()
 
 
 def test_rounded_rotations_are_projected():
-    poses = random_poses(0)
+    poses = random_poses(5, 0)
     checked = check_poses(np.round(poses, 4))
     np.testing.assert_allclose(checked[:, :3, :3] @ checked[:, :3, :3].swapaxes(1, 2),
                                np.tile(np.eye(3), (5, 1, 1)), atol=1e-14)  # fmt: skip
@@ -53,14 +46,14 @@ def test_rounded_rotations_are_projected():
     ],
 )
 def test_bad_poses_are_refused_by_row(spoil, words):
-    poses = random_poses(1)
+    poses = random_poses(5, 1)
     spoil(poses)
     with pytest.raises(InputError, match=words):
         check_poses(poses)
 
 
 def test_images_left_out_are_not_looked_at():
-    poses = random_poses(2)
+    poses = random_poses(5, 2)
     poses[3] = np.nan
     checked = check_poses(poses, np.array([1, 1, 1, 0, 1], bool))
     np.testing.assert_array_equal(checked[3], np.eye(4))
@@ -68,7 +61,7 @@ def test_images_left_out_are_not_looked_at():
 
 def test_transposed_poses_are_called_so():
     with pytest.raises(InputError, match="transposed"):
-        check_poses(random_poses(3).swapaxes(1, 2))
+        check_poses(random_poses(5, 3).swapaxes(1, 2))
 
 
 ANGLES = (0.0, 1e-200, 1e-9, 1e-4, 0.0999, 0.1, 0.1001, 1.0, np.pi, 6.0)

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import REAL_DATA
+from conftest import REAL_DATA, random_poses
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
@@ -25,14 +25,6 @@ from jaxcal.io.slicer import read_markups
 from jaxcal.io.trackers import read_tracker
 
 PROBE, REFERENCE = ("Probe", "Tracker"), ("Reference", "Tracker")
-
-
-def random_poses(count: int, seed: int = 0) -> np.ndarray:
-    rng = np.random.default_rng(seed)
-    poses = np.tile(np.eye(4), (count, 1, 1))
-    poses[:, :3, :3] = Rotation.random(count, random_state=seed).as_matrix()
-    poses[:, :3, 3] = rng.uniform(-200, 200, (count, 3))
-    return poses
 
 
 POSES = random_poses(6)

@@ -15,6 +15,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from conftest import random_poses
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -28,15 +29,6 @@ from jaxcal.study.results import open_results
 ROOT = Path(__file__).parents[1]
 COUNT = 6
 OPTIONAL = ("mask", "covariance", "max_elevation", "amplitude", "time", "velocity")
-
-
-def random_poses(generator, count):
-    rotations = np.linalg.qr(generator.normal(size=(count, 3, 3)))[0]
-    rotations[:, :, 0] *= np.linalg.det(rotations)[:, None]
-    poses = np.tile(np.eye(4), (count, 1, 1))
-    poses[:, :3, :3] = rotations
-    poses[:, :3, 3] = generator.uniform(-200, 200, (count, 3))
-    return poses
 
 
 def random_images(generator, kind, count, optional, elements=8):
@@ -65,7 +57,7 @@ def random_images(generator, kind, count, optional, elements=8):
     if kind != "time_of_flight":
         values["face_offset_mm"] = 1.25
     chosen = {name: value for name, value in values.items() if name in optional}
-    return make_images(random_poses(generator, count), measurements, kind, **chosen)
+    return make_images(random_poses(count, generator), measurements, kind, **chosen)
 
 
 def random_recording(seed=0, kind="point", count=COUNT, optional=(), parts=("test", "truth")):
@@ -74,7 +66,7 @@ def random_recording(seed=0, kind="point", count=COUNT, optional=(), parts=("tes
         calibration=random_images(generator, kind, count, optional),
         test=random_images(generator, kind, 5, optional) if "test" in parts else None,
         truth=Truth(
-            random_poses(generator, 1)[0],
+            random_poses(1, generator)[0],
             generator.normal(size=3) * 100,
             generator.uniform(-2, 2, count),
         )
@@ -110,7 +102,7 @@ def path(tmp_path):
     with h5py.File(path, "w") as file:
         file.attrs["format"] = "jaxcal-recording"
         file.attrs["version"] = 1
-        file["calibration/pose"] = random_poses(generator, COUNT)
+        file["calibration/pose"] = random_poses(COUNT, generator)
         file["calibration/point"] = generator.uniform(5, 80, (COUNT, 2))
     return path
 
@@ -242,7 +234,7 @@ def test_large_packed_chunks(tmp_path, values):
         file.create_group("probe").attrs.update(
             {"kind": "linear", "elements": elements, "pitch_mm": 0.05, "sound_speed_m_s": 1490.0}
         )
-        file["calibration/pose"] = random_poses(generator, count)
+        file["calibration/pose"] = random_poses(count, generator)
         file["calibration"].create_dataset(
             "time_of_flight", data=times, chunks=times.shape, compression="gzip"
         )

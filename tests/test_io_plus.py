@@ -345,11 +345,9 @@ def test_real_configurations(real_data, name):
     new, _ = patched_configuration(old, IMAGE, MATRIX)
     found = found_element(parse_xml(new))
     assert old.startswith(new[: found.start].rstrip())
-    had = [t for t in parse_xml(old).all("CoordinateDefinitions/Transform")
-           if {t.attributes["From"], t.attributes["To"]} == set(IMAGE)]  # fmt: skip
-    if had:
-        assert new[: had[0].start] == old[: had[0].start]
-        assert new[found.end :] == old[had[0].end :]
+    for had in filter(is_between, transforms(old)):
+        assert new[: had.start] == old[: had.start]
+        assert new[found.end :] == old[had.end :]
 
 
 DRESSES = {
@@ -375,8 +373,7 @@ def test_real_configurations_in_another_dress(real_data, dress):
         found = found_element(parse_xml(new))
         matrix = np.array(found.attributes["Matrix"].split(), float).reshape(4, 4)
         np.testing.assert_allclose(matrix, MATRIX, rtol=1e-14)
-        had = [t for t in parse_xml(old).all("CoordinateDefinitions/Transform")
-               if {t.attributes["From"], t.attributes["To"]} == set(IMAGE)]  # fmt: skip
+        had = list(filter(is_between, transforms(old)))
         if had:
             assert new[: had[0].start] == old[: had[0].start]
             assert new[found.end :] == old[had[0].end :]

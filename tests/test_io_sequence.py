@@ -10,24 +10,14 @@ import zlib
 
 import numpy as np
 import pytest
+from conftest import random_poses
 
 from jaxcal import FormatError, InputError
-from jaxcal.data.poses import rotations_from_quaternions
 from jaxcal.io import sequence_header
 from jaxcal.io.frame_names import check_frames, path_between, split_name
 from jaxcal.io.sequence_files import read_sequence, write_sequence
 
 PROBE, REFERENCE = ("Probe", "Tracker"), ("Reference", "Tracker")
-
-
-def random_poses(count: int, seed: int = 0) -> np.ndarray:
-    rng = np.random.default_rng(seed)
-    quaternions = rng.normal(size=(count, 4))
-    quaternions /= np.linalg.norm(quaternions, axis=1)[:, None]
-    poses = np.tile(np.eye(4), (count, 1, 1))
-    poses[:, :3, :3] = rotations_from_quaternions(quaternions, "xyzw")
-    poses[:, :3, 3] = rng.uniform(-200, 200, (count, 3))
-    return poses
 
 
 def written(path, count=5, **options):

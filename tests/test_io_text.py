@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import random_poses
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -31,18 +32,9 @@ def header(rows=3):
 HEADER = header()
 
 
-def random_poses(generator, count):
-    rotations = np.linalg.qr(generator.normal(size=(count, 3, 3)))[0]
-    rotations[:, :, 0] *= np.linalg.det(rotations)[:, None]
-    poses = np.tile(np.eye(4), (count, 1, 1))
-    poses[:, :3, :3] = rotations
-    poses[:, :3, 3] = generator.uniform(-200, 200, (count, 3))
-    return poses
-
-
 def csv_lines(count=5, rows=3, seed=0):
     generator = np.random.default_rng(seed)
-    poses = random_poses(generator, count)
+    poses = random_poses(count, generator)
     points = generator.uniform(10, 500, (count, 2))
     time = np.arange(count) / 30
     table = np.column_stack([time, poses[:, :rows].reshape(count, -1), points])
@@ -52,7 +44,7 @@ def csv_lines(count=5, rows=3, seed=0):
 @pytest.fixture
 def pair(tmp_path):
     generator = np.random.default_rng(1)
-    poses = random_poses(generator, 6)
+    poses = random_poses(6, generator)
     pixels = generator.integers(0, 600, (6, 2)).astype(float)
     rows = [" ".join(map(repr, row)) for row in poses[:, :3].reshape(-1, 4).tolist()]
     (tmp_path / "poses.txt").write_text("\n".join(rows) + "\n")

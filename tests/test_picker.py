@@ -17,6 +17,7 @@ from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
+from conftest import random_poses
 
 import jaxcal
 from jaxcal import FormatError, InputError, OutputError
@@ -43,11 +44,7 @@ PICK = [sys.executable, "-P", "-m", "jaxcal", "pick"]
 @pytest.fixture
 def sequence(tmp_path):
     """Seven frames without a credible target; number 2 was not tracked."""
-    from scipy.spatial.transform import Rotation
-
-    poses = np.tile(np.eye(4), (COUNT, 1, 1))
-    poses[:, :3, :3] = Rotation.random(COUNT, random_state=1).as_matrix()
-    poses[:, :3, 3] = np.random.default_rng(1).uniform(-100, 100, (COUNT, 3))
+    poses = random_poses(COUNT, 1)
     valid = {PAIR: np.arange(COUNT) != 2}
     path = tmp_path / "hard.igs.mha"
     write_sequence(path, {PAIR: poses}, np.arange(COUNT) / 10, valid=valid, images=list(FRAMES))
