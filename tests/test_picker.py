@@ -84,8 +84,7 @@ def click(browser, u: float, v: float) -> None:
     place = {"x": left + (u + 0.5) * scale, "y": top + (v + 0.5) * scale}
     for kind in ("mousePressed", "mouseReleased"):
         browser.execute_cdp_cmd(
-            "Input.dispatchMouseEvent",
-            {"type": kind, "button": "left", "clickCount": 1, **place},
+            "Input.dispatchMouseEvent", {"type": kind, "button": "left", "clickCount": 1, **place}
         )
 
 

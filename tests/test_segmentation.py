@@ -19,11 +19,7 @@ from jaxcal.cli.main import main
 from jaxcal.data.probe import C5_2, L14_5, LinearProbe
 from jaxcal.data.recording import Recording, make_images
 from jaxcal.data.segmentation.segment import OutOfPlane, compiled_fit, segment, segment_recording
-from jaxcal.data.segmentation.time_of_flight import (
-    fit_in_plane,
-    fit_out_of_plane,
-    shortest,
-)
+from jaxcal.data.segmentation.time_of_flight import fit_in_plane, fit_out_of_plane, shortest
 from jaxcal.diagnostics.metrics import reconstruct
 from jaxcal.study.simulation import Protocol, simulate_recording, times_of_flight
 

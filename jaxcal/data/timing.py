@@ -59,11 +59,7 @@ def _increasing(t: np.ndarray, what: str) -> Float[np.ndarray, " n"]:
 
 
 def can_interpolate(
-    t: np.ndarray,
-    query: np.ndarray,
-    *,
-    max_gap_s: float,
-    valid: np.ndarray | None = None,
+    t: np.ndarray, query: np.ndarray, *, max_gap_s: float, valid: np.ndarray | None = None
 ) -> Bool[np.ndarray, " m"]:
     """Which query times lie between two valid poses that are near enough to one another.
 

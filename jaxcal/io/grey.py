@@ -10,9 +10,7 @@ _WEIGHTS = np.array([0.299, 0.587, 0.114])
 """Of red, green and blue."""
 
 
-def grey_of(
-    pixels: Num[np.ndarray, "rows columns channels"],
-) -> Num[np.ndarray, "rows columns"]:
+def grey_of(pixels: Num[np.ndarray, "rows columns channels"]) -> Num[np.ndarray, "rows columns"]:
     """A grey frame of the same type: the first channel of one or two, else of three colours."""
     if pixels.shape[2] < 3:
         return pixels[:, :, 0]

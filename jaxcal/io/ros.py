@@ -130,9 +130,7 @@ def ros_yaml(
     )
 
 
-def read_ros_yaml(
-    path: str | os.PathLike[str],
-) -> tuple[Float[np.ndarray, "4 4"], dict[str, Any]]:
+def read_ros_yaml(path: str | os.PathLike[str]) -> tuple[Float[np.ndarray, "4 4"], dict[str, Any]]:
     """The rigid transform, mm, of a file as :func:`ros_yaml` or easy_handeye writes it.
 
     Only the seven numbers and our comment are looked for; nothing else of YAML is understood.

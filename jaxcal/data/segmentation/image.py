@@ -35,13 +35,7 @@ from jaxcal.data.segmentation.speckle import (
     decibel,
     envelope_of,
 )
-from jaxcal.data.segmentation.spot import (
-    Spot,
-    brightest,
-    fit_spot,
-    half_maximum,
-    saturated_pixels,
-)
+from jaxcal.data.segmentation.spot import Spot, brightest, fit_spot, half_maximum, saturated_pixels
 
 MAXIMUM_PIXELS = 2**24
 """Largest frame, px."""

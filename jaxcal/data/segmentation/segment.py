@@ -356,9 +356,7 @@ def check_times_of_flight(
         )
 
 
-def _end_of_window(
-    times: Float[np.ndarray, "n elements"],
-) -> Bool[np.ndarray, "n elements"]:
+def _end_of_window(times: Float[np.ndarray, "n elements"]) -> Bool[np.ndarray, "n elements"]:
     """Times that a receiver wrote where it heard nothing until the end of its window.
 
     More than 8 elements of a frame have exactly its longest time. With a clock, the target's own

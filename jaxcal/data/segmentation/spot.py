@@ -24,13 +24,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxcal.data.names import Target
-from jaxcal.data.segmentation.speckle import (
-    HALF_MAXIMUM,
-    NotFoundError,
-    Speckle,
-    decibel,
-    spread,
-)
+from jaxcal.data.segmentation.speckle import HALF_MAXIMUM, NotFoundError, Speckle, decibel, spread
 
 FINEST_SD = 0.005
 """Least SD stated for a position, px: no point spread is symmetric enough for a smaller one."""

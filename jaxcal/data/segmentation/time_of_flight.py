@@ -291,11 +291,7 @@ def _iterate(
         [jnp.stack([inverse[k] for k in row], axis=-1) for row in _ROWS[unknowns]], -2
     )
     return DistanceFit(
-        position=position,
-        inverse_normal=matrix,
-        noise=noise,
-        lines=lines,
-        rejected=rejected,
+        position=position, inverse_normal=matrix, noise=noise, lines=lines, rejected=rejected
     )
 
 

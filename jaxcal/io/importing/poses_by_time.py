@@ -227,10 +227,7 @@ def with_poses_by_time(
 
 
 def better_lag(
-    time: Float[np.ndarray, " n"],
-    points: Float[np.ndarray, "n 2"],
-    track: PoseTrack,
-    lag_s: float,
+    time: Float[np.ndarray, " n"], points: Float[np.ndarray, "n 2"], track: PoseTrack, lag_s: float
 ) -> list[str]:
     """A note if another lag fits the points far better than ``lag_s``, which was used.
 

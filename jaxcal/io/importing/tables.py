@@ -14,13 +14,7 @@ from jaxcal.io.importing.poses_by_time import PoseTrack
 from jaxcal.io.importing.sources import ImportOptions, kind_of, read_rows, refuse, selected
 from jaxcal.io.importing.two_tables import one_of_two_tables
 from jaxcal.io.table import first_line
-from jaxcal.io.text import (
-    MATRIX_WIDTHS,
-    PoseTable,
-    read_pair,
-    recording_of,
-    width_without_header,
-)
+from jaxcal.io.text import MATRIX_WIDTHS, PoseTable, read_pair, recording_of, width_without_header
 
 
 def from_tables(sources: Sequence[str | os.PathLike[str]], options: ImportOptions) -> Imported:

@@ -70,10 +70,7 @@ def one_of_two_tables(
 def _poses_of(
     poses: PoseTable, points: PoseTable, lag_s: float | Literal["auto"]
 ) -> tuple[
-    Float[np.ndarray, "n 4 4"],
-    Bool[np.ndarray, " n"],
-    Float[np.ndarray, "n 6"] | None,
-    list[str],
+    Float[np.ndarray, "n 4 4"], Bool[np.ndarray, " n"], Float[np.ndarray, "n 6"] | None, list[str]
 ]:
     """A pose for each point, whether it has one, the probe's velocities if known, and notes."""
     assert poses.poses is not None
