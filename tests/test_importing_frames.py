@@ -43,6 +43,7 @@ POSES = np.tile(np.eye(4), (COUNT, 1, 1))
 POSES[:, :3, :3] = Rotation.random(COUNT, random_state=3).as_matrix()
 POSES[:, :3, 3] = RNG.uniform(-150, 150, (COUNT, 3))
 NOT_TRACKED, HIDDEN, BLANK = 2, 5, 7
+MATRIX = ",".join(f"m{i}{j}" for i in range(1, 4) for j in range(1, 5))
 
 
 def speckle(rng, u=None, v=None) -> np.ndarray:
@@ -143,12 +144,8 @@ def test_segment_a_sequence(tmp_path, sequence, capsys):
     out = tmp_path / "other.h5"
     assert main(["segment", str(sequence), "--json", "--out", str(out)]) == 0
     record = json.loads(capsys.readouterr().out)
-    assert [record[key] for key in ("frames", "found", "not_credible", "not_tracked")] == [
-        9,
-        6,
-        1,
-        1,
-    ]
+    counts = [record[key] for key in ("frames", "found", "not_credible", "not_tracked")]
+    assert counts == [9, 6, 1, 1]
     assert [each["frame"] for each in record["per_frame"] if each["fate"] == "found"] == FOUND
     assert "dB over the background" in record["per_frame"][HIDDEN]["reason"]
 
@@ -591,8 +588,7 @@ def test_poses_by_time(tmp_path, kind, lag, capsys):
             ",".join(repr(float(x)) for x in [t, *pose[:3].ravel()])
             for t, pose in zip(MOMENTS, moving(MOMENTS), strict=True)
         ]
-        names = ["time", *(f"m{i}{j}" for i in range(1, 4) for j in range(1, 5))]
-        poses.write_text("\n".join([",".join(names), *rows]))
+        poses.write_text("\n".join([f"time,{MATRIX}", *rows]))
     out = str(tmp_path / "o.h5")
     arguments = ["import", str(tmp_path / "i.igs.mha"), out, "--poses-from", str(poses)]
     assert main([*arguments, "--lag", str(lag)]) == 0
@@ -625,8 +621,7 @@ def test_dates_are_not_matched_with_seconds(tmp_path, what, capsys):
         uv = tmp_path / "uv.csv"
         uv.write_text("\n".join(["u,v", *points]))
         rows = [",".join(repr(float(x)) for x in pose[:3].ravel()) for pose in moving(MOMENTS)]
-        names = ",".join(f"m{i}{j}" for i in range(1, 4) for j in range(1, 5))
-        log = dated(tmp_path / "t.csv", first, MOMENTS - 100.1, names, rows)
+        log = dated(tmp_path / "t.csv", first, MOMENTS - 100.1, MATRIX, rows)
         arguments = ["--poses", str(log)]
     out = tmp_path / "o.h5"
     assert main(["import", str(tmp_path / "i.igs.mha"), str(uv), str(out), *arguments]) == 2
@@ -781,9 +776,8 @@ def test_a_lag_that_fits_the_points_better_is_told(tmp_path, late, capsys):
     poses, target = turning(log), np.array([300.0, -40.0, 80.0])
     seen = np.linalg.inv(turning(times - late)) @ [*target, 1]
     rows = [[t, *pose[:3].ravel()] for t, pose in zip(log, poses, strict=True)]
-    names = ["time", *(f"m{i}{j}" for i in range(1, 4) for j in range(1, 5))]
-    table = [",".join(names), *(",".join(map(repr, map(float, row))) for row in rows)]
-    (tmp_path / "t.csv").write_text("\n".join(table))
+    lines = [",".join(map(repr, map(float, row))) for row in rows]
+    (tmp_path / "t.csv").write_text("\n".join([f"time,{MATRIX}", *lines]))
     points = 500 + 4 * seen[:, :2] + np.random.default_rng(2).normal(0, 1, (40, 2))
     lines = [f"{t},{u},{v}" for t, (u, v) in zip(times, points, strict=True)]
     (tmp_path / "p.csv").write_text("\n".join(["time,u,v", *lines]))
@@ -852,9 +846,8 @@ def test_a_lag_of_images_that_have_poses_of_their_own(tmp_path, kind, capsys):
     path = tmp_path / "o.h5"
     if kind == "table":
         rows = [times, *turning(times)[:, :3].reshape(60, 12).T, *points.T]
-        names = ["time", *(f"m{i}{j}" for i in range(1, 4) for j in range(1, 5)), "u", "v"]
         lines = [",".join(map(repr, map(float, row))) for row in np.column_stack(rows)]
-        (tmp_path / "t.csv").write_text("\n".join([",".join(names), *lines]))
+        (tmp_path / "t.csv").write_text("\n".join([f"time,{MATRIX},u,v", *lines]))
         assert main(["import", str(tmp_path / "t.csv"), str(path)]) == 0
         lag = 0.0
     else:

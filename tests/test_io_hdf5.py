@@ -114,6 +114,11 @@ def put(group, name, *arguments, **options):
     return group.create_dataset(name, *arguments, **options)
 
 
+def add_probe(file, elements):
+    values = {"kind": "linear", "elements": elements, "pitch_mm": 0.1, "sound_speed_m_s": 1490.0}
+    file.create_group("probe").attrs.update(values)
+
+
 def refused(path, message, error=FormatError):
     with pytest.raises(error, match=message) as caught:
         load(path)
@@ -231,9 +236,7 @@ def test_large_packed_chunks(tmp_path, values):
     path = tmp_path / "rec.h5"
     with h5py.File(path, "w") as file:
         file.attrs.update({"format": "jaxcal-recording", "version": 1})
-        file.create_group("probe").attrs.update(
-            {"kind": "linear", "elements": elements, "pitch_mm": 0.05, "sound_speed_m_s": 1490.0}
-        )
+        add_probe(file, elements)
         file["calibration/pose"] = random_poses(count, generator)
         file["calibration"].create_dataset(
             "time_of_flight", data=times, chunks=times.shape, compression="gzip"
@@ -775,9 +778,7 @@ def test_external_storage(path, tmp_path, there):
 )
 def test_absurd_sizes(path, name, shape, message):
     with h5py.File(path, "r+") as file:
-        file.create_group("probe").attrs.update(
-            {"kind": "linear", "elements": 8, "pitch_mm": 0.5, "sound_speed_m_s": 1490.0}
-        )
+        add_probe(file, 8)
         if name == "time_of_flight":
             del file["calibration/point"]
         chunks = tuple(min(length, 64) for length in shape)
@@ -792,9 +793,7 @@ def test_absurd_chunks(path):
     refused(path, "bytes for an array or chunk of shape")
     with h5py.File(path, "r+") as file:
         del file["calibration/time"], file["calibration/point"]
-        file.create_group("probe").attrs.update(
-            {"kind": "linear", "elements": 256, "pitch_mm": 0.5, "sound_speed_m_s": 1490.0}
-        )
+        add_probe(file, 256)
         put(file["calibration"], "time_of_flight", (100_000, 256), "f8", chunks=(1, 1))
     refused(path, "too many chunks")
 

@@ -36,7 +36,7 @@ VELOCITY_S = 0.05
 the tracker's noise of 0.1 mm becomes 1.4 mm/s."""
 
 LAG_EVIDENCE = 25.0
-"""A lag is told if its evidence is larger: a normal variable's square at 5 SD."""
+"""A lag is reported if its evidence is larger: a normal variable's square at 5 SD."""
 
 _COARSEST_S = 1e-3
 """A clock's times, as seconds, have digits for at least a millisecond."""

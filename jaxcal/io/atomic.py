@@ -141,14 +141,14 @@ def replace_files(
     """Replace a set of files that belong together: at no moment are old and new ones mixed.
 
     The new files are gathered in a folder :data:`STAGED` first; then the old ones are removed, and
-    then the new ones take their names, the first of them last. Who is killed in between leaves a
-    folder without that file; the next call puts it right. One process at a time does so, where the
-    system has locks.
+    then the new ones take their names, the first of them last. A process that is killed in between
+    leaves a folder without that file; the next call puts it right. Where the system has locks, one
+    process at a time does so.
 
     Args:
         folder: an existing folder; other files in it are left alone.
         files: name and content; the first one says that the set is whole.
-        names: of all files that such a set may have: those that it has not now are removed.
+        names: of all files that such a set may have; those that are not in ``files`` are removed.
 
     Raises:
         OutputError: they cannot be written, or another program is writing them. Old files are as

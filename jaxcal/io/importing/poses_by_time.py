@@ -28,10 +28,10 @@ LONGEST_GAP = 5.0
 _SHORT = 0.02
 """Images of less than this part of the tracking make one ask for the unit of its times."""
 _SHARED = 0.2
-"""Largest share of poses with the time stamp of another: it is that of stamps which are rounded to
-1.25 intervals between poses."""
+"""Largest share of poses with the time stamp of another; stamps that are rounded to 1.25 intervals
+between poses give this share."""
 _TOLD_MM = 0.5
-"""Larger errors of interpolation are told; the noise of a tracker looks like smaller ones."""
+"""Larger errors of interpolation are reported; a tracker's noise looks like smaller ones."""
 _LONGEST_GAP_OF_VELOCITY_S = 0.25
 """Longest time between two poses from which a velocity is taken."""
 _ROUNDED_S = 1e-6
