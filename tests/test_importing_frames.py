@@ -24,6 +24,7 @@ import jaxcal
 from jaxcal import FormatError, InputError, MissingExtraError
 from jaxcal.cli.main import main
 from jaxcal.cli.segment import _default_out
+from jaxcal.data.poses import matrices_from_rotations
 from jaxcal.io.dicom import read_pixel_size
 from jaxcal.io.folder import read_folder
 from jaxcal.io.importing.files import import_files
@@ -39,9 +40,9 @@ ROWS, COLUMNS, COUNT = 110, 150, 9
 PAIR = ("Probe", "Tracker")
 RNG = np.random.default_rng(4)
 POINTS = RNG.uniform([25, 25], [COLUMNS - 25, ROWS - 25], (COUNT, 2))
-POSES = np.tile(np.eye(4), (COUNT, 1, 1))
-POSES[:, :3, :3] = Rotation.random(COUNT, random_state=3).as_matrix()
-POSES[:, :3, 3] = RNG.uniform(-150, 150, (COUNT, 3))
+POSES = matrices_from_rotations(
+    Rotation.random(COUNT, random_state=3).as_matrix(), RNG.uniform(-150, 150, (COUNT, 3))
+)
 NOT_TRACKED, HIDDEN, BLANK = 2, 5, 7
 MATRIX = ",".join(f"m{i}{j}" for i in range(1, 4) for j in range(1, 5))
 
@@ -566,11 +567,9 @@ MOMENTS = np.arange(200) / 50 + 100.0
 
 def moving(t: np.ndarray) -> np.ndarray:
     """A smooth motion."""
-    poses = np.tile(np.eye(4), (len(t), 1, 1))
     turns = np.stack([0.5 * np.sin(t), 0.3 * np.cos(1.3 * t), 0.2 * t], axis=1)
-    poses[:, :3, :3] = Rotation.from_rotvec(turns).as_matrix()
-    poses[:, :3, 3] = np.stack([50 * np.sin(t), 20 * np.cos(t), 5 * t], axis=1)
-    return poses
+    moved = np.stack([50 * np.sin(t), 20 * np.cos(t), 5 * t], axis=1)
+    return matrices_from_rotations(Rotation.from_rotvec(turns).as_matrix(), moved)
 
 
 @pytest.mark.parametrize("kind", ["sequence", "table"])
@@ -746,11 +745,9 @@ def to_and_fro(t: np.ndarray) -> np.ndarray:
 
 def swept(t: np.ndarray) -> np.ndarray:
     """Poses of a probe that goes to and fro by 40 mm and turns a little."""
-    poses = np.tile(np.eye(4), (len(t), 1, 1))
     turns = 0.02 * np.stack([np.sin(t), np.cos(1.3 * t), np.sin(0.7 * t)], axis=1)
-    poses[:, :3, :3] = Rotation.from_rotvec(turns).as_matrix()
-    poses[:, :3, 3] = [100, 50, 20] + 20 * to_and_fro(t)[:, None] * [0.6, -0.48, 0.64]
-    return poses
+    moved = [100, 50, 20] + 20 * to_and_fro(t)[:, None] * [0.6, -0.48, 0.64]
+    return matrices_from_rotations(Rotation.from_rotvec(turns).as_matrix(), moved)
 
 
 @pytest.fixture
@@ -813,12 +810,9 @@ def turning(t: np.ndarray) -> np.ndarray:
     """Poses that keep a target in front of the probe, which turns and moves in all directions."""
     frequency, phase = np.array([0.9, 1.3, 0.7, 1.1, 1.7, 0.6]), np.arange(6)
     wave = np.sin(t[:, None] * frequency + phase)
-    poses = np.tile(np.eye(4), (len(t), 1, 1))
-    poses[:, :3, :3] = Rotation.from_rotvec(0.5 * wave[:, :3]).as_matrix()
+    turns = Rotation.from_rotvec(0.5 * wave[:, :3])
     in_probe = [30, 20, 60] + wave[:, 3:] * [20, 15, 0.5]
-    turned = np.einsum("nij,nj->ni", poses[:, :3, :3], in_probe)
-    poses[:, :3, 3] = [300, -40, 80] - turned
-    return poses
+    return matrices_from_rotations(turns.as_matrix(), [300, -40, 80] - turns.apply(in_probe))
 
 
 def test_a_lag_is_estimated_from_points(tmp_path, lagging, capsys):

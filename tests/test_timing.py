@@ -10,6 +10,7 @@ from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
 
 from jaxcal import InputError
+from jaxcal.data.poses import matrices_from_rotations
 from jaxcal.data.timing import (
     can_interpolate,
     fit_clock,
@@ -22,11 +23,9 @@ from jaxcal.data.timing import (
 
 def screw(t: np.ndarray, turn: np.ndarray, speed: np.ndarray) -> np.ndarray:
     """Poses that turn at a constant rate about a fixed axis and move at a constant speed."""
-    poses = np.tile(np.eye(4), (len(t), 1, 1))
-    start = Rotation.from_rotvec([0.3, -0.2, 2.9])
-    poses[:, :3, :3] = (start * Rotation.from_rotvec(t[:, None] * turn)).as_matrix()
-    poses[:, :3, 3] = [100, -50, 400] + t[:, None] * speed
-    return poses
+    turned = Rotation.from_rotvec([0.3, -0.2, 2.9]) * Rotation.from_rotvec(t[:, None] * turn)
+    moved = [100, -50, 400] + t[:, None] * speed
+    return matrices_from_rotations(turned.as_matrix(), moved)
 
 
 @settings(max_examples=40)
@@ -48,12 +47,9 @@ def test_a_smooth_motion_at_125_hz() -> None:
     """A to and fro at up to 50 mm/s: microns off, where the nearest sample is 0.2 mm off."""
 
     def path(t: np.ndarray) -> np.ndarray:
-        poses = np.tile(np.eye(4), (len(t), 1, 1))
-        poses[:, 0, 3] = 20 * np.sin(2.5 * t)
-        poses[:, :3, :3] = Rotation.from_rotvec(
-            np.sin(t)[:, None] * [0.1, 0.2, -0.1]
-        ).as_matrix()  # fmt: skip
-        return poses
+        turned = Rotation.from_rotvec(np.sin(t)[:, None] * [0.1, 0.2, -0.1])
+        moved = np.sin(2.5 * t)[:, None] * [20, 0, 0]
+        return matrices_from_rotations(turned.as_matrix(), moved)
 
     t = np.arange(0, 4, 0.008)
     query = np.random.default_rng(3).uniform(0, 3.99, 200)
@@ -66,11 +62,9 @@ def test_a_smooth_motion_at_125_hz() -> None:
 
 def wandering(t: np.ndarray) -> np.ndarray:
     """Poses of a probe that moves and turns irregularly, with periods of 5 to 12 s."""
-    poses = np.tile(np.eye(4), (len(t), 1, 1))
     waves = np.sin(t[:, None] * [0.53, 0.71, 1.23, 0.6, 0.9, 1.1] + np.arange(6))
-    poses[:, :3, :3] = Rotation.from_rotvec(0.2 * waves[:, :3]).as_matrix()
-    poses[:, :3, 3] = 30 * waves[:, 3:]
-    return poses
+    turned = Rotation.from_rotvec(0.2 * waves[:, :3])
+    return matrices_from_rotations(turned.as_matrix(), 30 * waves[:, 3:])
 
 
 @pytest.mark.parametrize("interval", [0.1, 0.5, 1.0])
@@ -225,9 +219,8 @@ def test_a_periodic_motion_fits_several_lags(frequency: float, every: float) -> 
 def test_velocities_are_those_of_a_screw() -> None:
     """Exact for a constant screw: the pose a little later is the pose times Exp."""
     t, turn = np.arange(0, 2, 0.05), np.array([0.3, -0.5, 0.2])
-    poses = np.tile(np.eye(4), (len(t), 1, 1))
-    poses[:, :3, :3] = Rotation.from_rotvec(t[:, None] * turn).as_matrix()
-    poses[:, :3, 3] = np.cumsum(np.ones((len(t), 1)) * [0.5, 0.0, 0.0], axis=0)
+    moved = np.cumsum(np.ones((len(t), 1)) * [0.5, 0.0, 0.0], axis=0)
+    poses = matrices_from_rotations(Rotation.from_rotvec(t[:, None] * turn).as_matrix(), moved)
     query = np.array([0.02, 0.5, 1.0, 1.93])
     found = pose_velocities(t, poses, query, max_gap_s=0.1)
     assert np.isnan(found[[0, 3]]).all()
@@ -255,10 +248,8 @@ def freehand(t: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
     pixels = [160, 120] + wave[:, 3:5] * [110, 80]
     seen = np.column_stack([pixels * [0.2, 0.15], 0.8 * wave[:, 5]])
     in_probe = seen @ Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix().T + [20, -35, 50]
-    poses = np.tile(np.eye(4), (len(t), 1, 1))
-    poses[:, :3, :3] = Rotation.from_rotvec(0.5 * wave[:, :3] + [1.0, 0.3, -2.0]).as_matrix()
-    turned = np.einsum("nij,nj->ni", poses[:, :3, :3], in_probe)
-    poses[:, :3, 3] = [100, -50, -900] - turned
+    turns = Rotation.from_rotvec(0.5 * wave[:, :3] + [1.0, 0.3, -2.0])
+    poses = matrices_from_rotations(turns.as_matrix(), [100, -50, -900] - turns.apply(in_probe))
     return poses, pixels + rng.normal(0, 1, pixels.shape)
 
 

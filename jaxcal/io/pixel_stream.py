@@ -65,15 +65,8 @@ class PixelStream:
         Raises:
             FormatError: damaged, or the file ends before.
         """
-        try:
-            if self._inflate is None:
-                self._file.seek(offset - self._position, 1)
-                content = self._file.read(count)
-            else:
-                self._skip(offset - self._position)
-                content = self._unpack(count)
-        except (OSError, zlib.error) as error:
-            raise FormatError(f"the pixels are damaged: {one_line(error)}") from None
+        self._skip(offset - self._position)
+        content = self._next(count)
         if len(content) != count:
             raise FormatError(f"the pixels end at byte {offset + len(content)} of {self._size}")
         self._position = offset + count
@@ -87,30 +80,31 @@ class PixelStream:
         """
         if self._inflate is None or self._position != self._size:
             return
-        try:
-            more = self._unpack(1)
-        except (OSError, zlib.error) as error:
-            raise FormatError(f"the pixels are damaged: {one_line(error)}") from None
-        if more:
+        if self._next(1):
             raise FormatError(f"the pixels inflate beyond their size, {self._size} bytes")
         if not self._inflate.eof:
             raise FormatError("the pixels are damaged: the end of the compressed data is missing")
 
     def _skip(self, count: int) -> None:
-        while count > 0:
-            skipped = len(self._unpack(min(count, _PORTION)))
-            if not skipped:
-                return
+        if self._inflate is None:
+            self._file.seek(count, 1)
+            return
+        while count > 0 and (skipped := len(self._next(min(count, _PORTION)))):
             count -= skipped
 
-    def _unpack(self, count: int) -> bytes:
-        assert self._inflate is not None
+    def _next(self, count: int) -> bytes:
+        """The next bytes, unpacked; fewer where the pixels end."""
         parts: list[bytes] = []
-        while count > 0 and not self._inflate.eof:
-            packed = self._inflate.unconsumed_tail or self._file.read(_PORTION)
-            part = self._inflate.decompress(packed, count)
-            if not packed and not part:
-                break
-            parts.append(part)
-            count -= len(part)
+        try:
+            if self._inflate is None:
+                return self._file.read(count)
+            while count > 0 and not self._inflate.eof:
+                packed = self._inflate.unconsumed_tail or self._file.read(_PORTION)
+                part = self._inflate.decompress(packed, count)
+                if not packed and not part:
+                    break
+                parts.append(part)
+                count -= len(part)
+        except (OSError, zlib.error) as error:
+            raise FormatError(f"the pixels are damaged: {one_line(error)}") from None
         return b"".join(parts)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hmac
 import json
+import re
 import secrets
 import threading
 from contextlib import suppress
@@ -195,19 +196,14 @@ class _Handler(BaseHTTPRequestHandler):
             self._json({"error": str(error)}, HTTPStatus.BAD_REQUEST)
 
     def _send_frame(self, rest: str) -> None:
-        number = rest.removeprefix("frame/").removesuffix(".png")
-        if (
-            rest != f"frame/{number}.png"
-            or not number.isdecimal()
-            or len(number) > 9
-            or int(number) not in self.page.picks.shown
-        ):
+        found = re.fullmatch(r"frame/([0-9]{1,9})\.png", rest)
+        if found is None or int(found[1]) not in self.page.picks.shown:
             self._refuse(HTTPStatus.NOT_FOUND)
-        else:
-            try:
-                self._answer(self.page.frames.png(int(number)), "image/png")
-            except CalibrationError as error:
-                self._json({"error": str(error)}, HTTPStatus.INTERNAL_SERVER_ERROR)
+            return
+        try:
+            self._answer(self.page.frames.png(int(found[1])), "image/png")
+        except CalibrationError as error:
+            self._json({"error": str(error)}, HTTPStatus.INTERNAL_SERVER_ERROR)
 
     def _allowed(self) -> str | None:
         """The requested path, if token, host and origin are right; None if it was refused."""
