@@ -41,6 +41,12 @@ def table(names, columns, separator=",", comma=False):
     return lines
 
 
+def imported(tmp_path, lines, **options):
+    """What comes of a table with these lines."""
+    (tmp_path / "t.csv").write_text("\n".join(lines))
+    return import_files([tmp_path / "t.csv"], ImportOptions(**options))
+
+
 NAMES = ["u", "v", "x", "y", "z", "qx", "qy", "qz", "qw"]
 COLUMNS = [PIXELS, TRANSLATIONS, QUATERNIONS]
 SCALAR_FIRST = [PIXELS, TRANSLATIONS, QUATERNIONS[:, [3, 0, 1, 2]]]
@@ -79,8 +85,7 @@ MATRIX = [f"m{i}{j}" for i in range(1, 4) for j in range(1, 5)]
     ],
 )  # fmt: skip
 def test_headers_are_read(tmp_path, lines):
-    (tmp_path / "t.csv").write_text("\n".join(lines))
-    recording, notes, *_ = import_files([tmp_path / "t.csv"])
+    recording, notes, *_ = imported(tmp_path, lines)
     images = recording.calibration
     np.testing.assert_allclose(images.poses, POSES, atol=1e-11)
     np.testing.assert_allclose(images.measurements, PIXELS, rtol=1e-14)
@@ -94,13 +99,8 @@ def test_times_of_every_kind(tmp_path):
         ("stamp_ns", [10**18 + 10**9 * k for k in range(6)], 1e9 + np.arange(6)),
         ("Timestamp", [f"2026-11-21T21:00:0{k}.5" for k in range(6)], np.arange(6.0)),
     ):
-        lines = table(NAMES, COLUMNS)
-        lines = [
-            f"{name},{lines[0]}",
-            *(f"{s},{r}" for s, r in zip(stamps, lines[1:], strict=True)),
-        ]
-        (tmp_path / "t.csv").write_text("\n".join(lines))
-        found = import_files([tmp_path / "t.csv"])[0].calibration.time
+        rows = zip([name, *stamps], table(NAMES, COLUMNS), strict=True)
+        found = imported(tmp_path, [f"{first},{row}" for first, row in rows])[0].calibration.time
         np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
@@ -108,38 +108,33 @@ def test_quaternion_order_is_asked_for(tmp_path):
     numbered = table([*NAMES[:5], "q1", "q2", "q3", "q4"], COLUMNS)
     bare = table(None, [np.arange(6), TRANSLATIONS, QUATERNIONS, PIXELS])
     for lines in (numbered, bare):
-        (tmp_path / "t.csv").write_text("\n".join(lines))
         with pytest.raises(FormatError, match="--quaternion wxyz or xyzw"):
-            import_files([tmp_path / "t.csv"])
-        options = ImportOptions(quaternion="xyzw")
-        found = import_files([tmp_path / "t.csv"], options)[0].calibration
+            imported(tmp_path, lines)
+        found = imported(tmp_path, lines, quaternion="xyzw")[0].calibration
         np.testing.assert_allclose(found.poses, POSES, atol=1e-11)
-        other = import_files([tmp_path / "t.csv"], ImportOptions(quaternion="wxyz"))[0].calibration
+        other = imported(tmp_path, lines, quaternion="wxyz")[0].calibration
         expected = Rotation.from_quat(QUATERNIONS[:, [1, 2, 3, 0]]).as_matrix()
         np.testing.assert_allclose(other.poses[:, :3, :3], expected, atol=1e-12)
 
 
 def test_the_numbers_of_quaternions_columns_count_and_not_their_order(tmp_path):
     mixed = table([*NAMES[:5], "q1", "q2", "q3", "q0"], COLUMNS)
-    (tmp_path / "t.csv").write_text("\n".join(mixed))
-    found = import_files([tmp_path / "t.csv"], ImportOptions(quaternion="wxyz"))[0].calibration
+    found = imported(tmp_path, mixed, quaternion="wxyz")[0].calibration
     np.testing.assert_allclose(found.poses, POSES, atol=1e-11)
     for numbers in ("1111", "0114", "0124"):
         named = table([*NAMES[:5], *(f"q{number}" for number in numbers)], COLUMNS)
-        (tmp_path / "t.csv").write_text("\n".join(named))
         with pytest.raises(FormatError, match="must be numbered q0 to q3, or q1 to q4"):
-            import_files([tmp_path / "t.csv"], ImportOptions(quaternion="wxyz"))
+            imported(tmp_path, named, quaternion="wxyz")
 
 
 def test_an_order_that_contradicts_the_header_is_refused(tmp_path):
-    (tmp_path / "t.csv").write_text("\n".join(table(NAMES, COLUMNS)))
-    named = import_files([tmp_path / "t.csv"], ImportOptions(quaternion="xyzw"))[0].calibration
+    last = table(NAMES, COLUMNS)
+    named = imported(tmp_path, last, quaternion="xyzw")[0].calibration
     np.testing.assert_allclose(named.poses, POSES, atol=1e-11)
     with pytest.raises(FormatError, match="numbers are x y z w, and --quaternion says wxyz"):
-        import_files([tmp_path / "t.csv"], ImportOptions(quaternion="wxyz"))
+        imported(tmp_path, last, quaternion="wxyz")
     first = table([*NAMES[:5], "qw", "qx", "qy", "qz"], SCALAR_FIRST)
-    (tmp_path / "t.csv").write_text("\n".join(first))
-    named = import_files([tmp_path / "t.csv"], ImportOptions(quaternion="wxyz"))[0].calibration
+    named = imported(tmp_path, first, quaternion="wxyz")[0].calibration
     np.testing.assert_allclose(named.poses, POSES, atol=1e-11)
 
 
@@ -167,17 +162,15 @@ def test_invalid_rows_are_counted(tmp_path):
     more = [lines[1].replace(",1.0", ",OUT_OF_VIEW"), "# a comment, not a row"]
     # The last two are what spreadsheets leave of a formula that failed.
     more += [cell + lines[2][lines[2].index(",") :] for cell in ("nan", "#N/A", "#NAME?")]
-    (tmp_path / "t.csv").write_text("\n".join([*lines, *more]))
     with pytest.raises(FormatError, match=r"t\.csv:8: the row is marked as invalid"):
-        import_files([tmp_path / "t.csv"])
-    recording, notes, *_ = import_files([tmp_path / "t.csv"], ImportOptions(skip_invalid=True))
+        imported(tmp_path, [*lines, *more])
+    recording, notes, *_ = imported(tmp_path, [*lines, *more], skip_invalid=True)
     assert len(recording) == 6
     left_out = "4 invalid rows left out (6, 7, 8, 9, counted from 0)"
     assert notes == [f"{tmp_path / 't.csv'}: {left_out}"]
     assert recording.calibration.frame is None
     # Images are told by their rows where rows are missing among them.
-    (tmp_path / "t.csv").write_text("\n".join([lines[0], more[0], *lines[1:]]))
-    recording, *_ = import_files([tmp_path / "t.csv"], ImportOptions(skip_invalid=True))
+    recording, *_ = imported(tmp_path, [lines[0], more[0], *lines[1:]], skip_invalid=True)
     np.testing.assert_array_equal(recording.calibration.frame, np.arange(1, 7))
 
 
@@ -185,16 +178,14 @@ def test_a_pose_of_zeros_is_that_of_a_tool_not_seen(tmp_path):
     lines = table(NAMES, COLUMNS)
     cells = lines[3].split(",")
     lost = ",".join([*cells[:2], *["0"] * (len(cells) - 2)])
-    (tmp_path / "t.csv").write_text("\n".join([*lines, lost]))
     with pytest.raises(FormatError, match=r"t\.csv:8: the rotation is all zeros.*--skip-invalid"):
-        import_files([tmp_path / "t.csv"])
-    assert len(import_files([tmp_path / "t.csv"], ImportOptions(skip_invalid=True)).recording) == 6
+        imported(tmp_path, [*lines, lost])
+    assert len(imported(tmp_path, [*lines, lost], skip_invalid=True).recording) == 6
 
 
 def test_empty_rows_at_the_end_do_not_count(tmp_path):
     lines = table(NAMES, COLUMNS)
-    (tmp_path / "t.csv").write_text("\n".join([*lines, ",,,,,,,,", ",,,", ""]))
-    recording, notes, *_ = import_files([tmp_path / "t.csv"])
+    recording, notes, *_ = imported(tmp_path, [*lines, ",,,,,,,,", ",,,", ""])
     assert (len(recording), notes) == (6, [])
 
 
@@ -237,42 +228,35 @@ def test_headers_that_are_refused(names, message):
 )  # fmt: skip
 def test_rows_that_are_refused(tmp_path, change, message):
     rows = table(NAMES, COLUMNS)
-    (tmp_path / "t.csv").write_text("\n".join([*rows[:3], change(rows[3])]))
     with pytest.raises(InputError, match=re.escape(message)):
-        import_files([tmp_path / "t.csv"])
+        imported(tmp_path, [*rows[:3], change(rows[3])])
 
 
 def test_times_that_go_back(tmp_path):
     lines = table(["time", *NAMES], [[0.0, 1, 2, 2, 3, 1], *COLUMNS])
-    (tmp_path / "t.csv").write_text("\n".join(lines))
-    with pytest.raises(
-        InputError, match=r"t\.csv:5: the time stamp is not later than the one before"
-    ):
-        import_files([tmp_path / "t.csv"])
-    recording, notes, *_ = import_files([tmp_path / "t.csv"], ImportOptions(ignore_time=True))
+    with pytest.raises(InputError, match=r"t\.csv:5: the time stamp is not later than the one be"):
+        imported(tmp_path, lines)
+    recording, notes, *_ = imported(tmp_path, lines, ignore_time=True)
     assert recording.calibration.time is None
     assert "not kept" in notes[0]
-    (tmp_path / "t.csv").write_text(
-        "\n".join([*lines[:3], lines[3][lines[3].index(",") :], *lines[4:]])
-    )
-    recording, notes, *_ = import_files([tmp_path / "t.csv"], ImportOptions(ignore_time=True))
+    lines[3] = lines[3][lines[3].index(",") :]
+    recording, notes, *_ = imported(tmp_path, lines, ignore_time=True)
     assert (len(recording), recording.calibration.time) == (6, None)
     assert notes == ["time stamps are missing or cannot be read: not kept"]
 
 
 def test_ignoring_bad_times_keeps_good_ones(tmp_path):
     """Those of a table like those of a sequence."""
-    (tmp_path / "t.csv").write_text("\n".join(table(["time", *NAMES], [np.arange(6.0), *COLUMNS])))
-    recording, notes, *_ = import_files([tmp_path / "t.csv"], ImportOptions(ignore_time=True))
+    lines = table(["time", *NAMES], [np.arange(6.0), *COLUMNS])
+    recording, notes, *_ = imported(tmp_path, lines, ignore_time=True)
     np.testing.assert_array_equal(recording.calibration.time, np.arange(6.0))
     assert notes == []
 
 
 def test_times_in_another_unit_than_seconds(tmp_path):
     lines = table(["time", *NAMES], [1.7e18 + 1e9 * np.arange(6), *COLUMNS])
-    (tmp_path / "t.csv").write_text("\n".join(lines))
     with pytest.raises(FormatError, match=r"t\.csv:2: column 1 \('time'\) is 1\.7e\+18 s.*\[ns\]"):
-        import_files([tmp_path / "t.csv"])
+        imported(tmp_path, lines)
 
 
 # Trackers' exports. The lines are those of real files, shortened.
@@ -683,16 +667,14 @@ def test_a_pose_that_cannot_be_inverted_is_named(tmp_path):
 def test_a_probe_at_rest_is_not_taken_for_metres(tmp_path):
     """Poses between two frames on one body differ by rounding."""
     lines = table(NAMES, [PIXELS, 1e-15 * TRANSLATIONS, QUATERNIONS])
-    (tmp_path / "t.csv").write_text("\n".join(lines))
-    assert len(import_files([tmp_path / "t.csv"])[0].calibration) == 6
+    assert len(imported(tmp_path, lines)[0].calibration) == 6
 
 
 def test_a_stated_unit_is_not_advised_against(tmp_path):
     lines = table([*NAMES[:2], "x [mm]", "y [mm]", "z [mm]", *NAMES[5:]], COLUMNS)
     scaled = table(NAMES, [PIXELS, TRANSLATIONS / 1e3, QUATERNIONS])
-    (tmp_path / "t.csv").write_text("\n".join([lines[0], *scaled[1:]]))
     with pytest.raises(InputError, match=r"look like metres; give them in mm$"):
-        import_files([tmp_path / "t.csv"])
+        imported(tmp_path, [lines[0], *scaled[1:]])
     (tmp_path / "m.csv").write_text(MOTIVE)
     (tmp_path / "p.csv").write_text("u,v\n1,1\n1,1\n")
     with pytest.raises(FormatError, match="its Length Units are meters, not mm"):
@@ -727,11 +709,9 @@ def test_which_dates_are_read_is_told(tmp_path, clock):
     """MATLAB and Excel write others."""
     lines = [f"{clock},{line}" for line in table(NAMES, COLUMNS)]
     lines[0] = lines[0].replace(clock, "time")
-    (tmp_path / "t.csv").write_text("\n".join(lines))
     with pytest.raises(FormatError, match=r"t\.csv:2: column 1 \('time'\) is neither .* ISO 8601"):
-        import_files([tmp_path / "t.csv"])
-    notes = import_files([tmp_path / "t.csv"], ImportOptions(ignore_time=True)).notes
-    assert "not kept" in notes[0]
+        imported(tmp_path, lines)
+    assert "not kept" in imported(tmp_path, lines, ignore_time=True).notes[0]
 
 
 POINTS_OF_SIX = "\n".join(table(["u", "v"], [PIXELS]))

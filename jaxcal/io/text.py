@@ -450,6 +450,7 @@ def _used_rows(
     ]
     pose, comma = columns.quaternion or columns.matrix or (), table.separator != ","
     kept: list[int] = []
+    skipped: list[int] = []
     for row, cells in enumerate(table.rows):
         missing = _first_missing(cells, needed)
         if columns.valid is not None and not _is_valid(table, row, columns.valid):
@@ -463,9 +464,10 @@ def _used_rows(
             continue
         if not skip_invalid:
             raise FormatError(f"{table.row(row)}: {why}: leave such rows out with --skip-invalid")
+        skipped.append(row)
     if not kept:
         raise FormatError(f"all {len(table.rows)} rows are marked as invalid")
-    return kept, tuple(sorted(set(range(len(table.rows))) - set(kept)))
+    return kept, tuple(skipped)
 
 
 def _first_missing(cells: list[str], columns: list[int]) -> int | None:

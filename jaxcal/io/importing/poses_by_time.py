@@ -312,7 +312,5 @@ def _check_unit(images: TrackedSequence, track: PoseTrack) -> None:
 
 def _within(asked: Float[np.ndarray, " n"], time: Float[np.ndarray, " m"]) -> np.ndarray:
     """Times, those that only rounding puts before the first or after the last pose at that pose."""
-    if not len(time):
-        return asked
     nearest = np.clip(asked, time[0], time[-1])
     return np.where(np.abs(asked - nearest) <= _ROUNDED_S, nearest, asked)

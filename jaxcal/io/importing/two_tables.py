@@ -90,14 +90,13 @@ def _poses_of(
             {}, {}, points.time, everywhere, source=points.name, clock=points.clock
         )
         tracking = tracking_of_table(poses, images)
-        track, estimated = PoseTrack.of(tracking), lag_s == "auto"
-        notes: list[str] = []
+        track = PoseTrack.of(tracking)
         if lag_s == "auto":
             lag_s, told = lag_of_points(points.time, points.points, track)
             notes = [told]
-        images, said = with_poses_by_time(images, tracking, lag_s)
-        if not estimated:
+        else:
             notes = better_lag(points.time, points.points, track, lag_s)
+        images, said = with_poses_by_time(images, tracking, lag_s)
         (found,), (valid,) = images.transforms.values(), images.valid.values()
         return found, valid, track.velocities(points.time - lag_s), said + notes
     _refuse_lag(lag_s)
