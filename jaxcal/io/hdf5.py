@@ -167,24 +167,19 @@ def _read(source: str | os.PathLike[str] | io.BytesIO, name: str) -> Recording:
     with naming(name), open_root(source) as root:
         _check_header(root)
         probe = _read_probe(root)
-        selected = _read_images(root, "calibration", probe, MINIMUM_IMAGES)
-        if selected is None:
+        calibration, test, truth = (group(root, part) for part in ("calibration", "test", "truth"))
+        if calibration is None:
             raise FormatError("has no /calibration: there are no images to calibrate with")
+        selected = _read_images(calibration, probe, MINIMUM_IMAGES)
+        source, target = (text(calibration, attribute) for attribute in _POSE_FRAMES)
         return Recording(
             calibration=selected,
-            test=_read_images(root, "test", probe, minimum=1),
-            truth=_read_truth(root, len(selected)),
+            test=None if test is None else _read_images(test, probe, minimum=1),
+            truth=None if truth is None else _read_truth(truth, len(selected)),
             probe=probe,
             source=name,
-            pose_frames=_read_frames(root),
+            pose_frames=None if source is None or target is None else (source, target),
         )
-
-
-def _read_frames(root: Node) -> tuple[str, str] | None:
-    """The names of the calibration poses' frames."""
-    images = group(root, "calibration")
-    source, target = (None if images is None else text(images, name) for name in _POSE_FRAMES)
-    return None if source is None or target is None else (source, target)
 
 
 def _check_header(root: Node) -> None:
@@ -233,10 +228,7 @@ def _read_probe(root: Node) -> Probe | None:
         raise FormatError(f"/probe: {error}") from None
 
 
-def _read_images(root: Node, name: str, probe: Probe | None, minimum: int) -> Images | None:
-    node = group(root, name)
-    if node is None:
-        return None
+def _read_images(node: Node, probe: Probe | None, minimum: int) -> Images:
     _check_units(node, "mm")
     kind = _kind(node)
     if kind == "time_of_flight" and probe is None:
@@ -304,10 +296,7 @@ def _read_scale(node: Node, kind: Kind) -> tuple[np.ndarray | None, float, np.nd
     return stated("spacing_mm", 2), face, stated("frame_size", 2)
 
 
-def _read_truth(root: Node, count: int) -> Truth | None:
-    node = group(root, "truth")
-    if node is None:
-        return None
+def _read_truth(node: Node, count: int) -> Truth:
     image_to_probe = _dataset(node, "image_to_probe", (4, 4), "mm")
     point = _dataset(node, "point", (3,), "mm")
     elevation = _dataset(node, "elevation", (IMAGES,), "mm")

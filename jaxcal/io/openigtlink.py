@@ -291,14 +291,13 @@ def encode(message: Message) -> bytes:
     Raises:
         ValueError: a content that does not go with the kind, or a name that is too long.
     """
-    metadata = {}
+    status = ""
     match message.content:
         case Picture() if message.kind == "IMAGE":
             content = _encode_image(message.content)
         case (Tracked(),) if message.kind == "TRANSFORM":
             content = _encode_matrix(message.content[0].matrix)
-            if message.content[0].status:
-                metadata = {_TRANSFORM_STATUS: message.content[0].status}
+            status = message.content[0].status
         case tuple() if message.kind == "TDATA":
             content = b"".join(_encode_tracked(each) for each in message.content)
         case StatusMessage(code, subcode, name, text) if message.kind == "STATUS":
@@ -310,22 +309,21 @@ def encode(message: Message) -> bytes:
         case _:
             raise ValueError(f"{message.kind} cannot hold {type(message.content).__name__}")
     version = 1
-    if message.message_id or metadata:
+    if message.message_id or status:
         version = 2
-        names, values = _encode_metadata(metadata)
+        names, values = _encode_status(status)
         head = _EXTENDED.pack(_EXTENDED.size, len(names), len(values), message.message_id)
         content = head + content + names + values
     return encode_header(version, message, content) + content
 
 
-def _encode_metadata(metadata: dict[str, str]) -> tuple[bytes, bytes]:
-    if not metadata:
+def _encode_status(status: str) -> tuple[bytes, bytes]:
+    """Metadata with the status of a transform: the table of sizes, and the texts."""
+    if not status:
         return b"", b""
-    table, texts = [len(metadata).to_bytes(2, "big")], []
-    for name, value in metadata.items():
-        texts += [name.encode(), value.encode()]
-        table.append(_METADATA.pack(len(texts[-2]), _US_ASCII, len(texts[-1])))
-    return b"".join(table), b"".join(texts)
+    name, value = _TRANSFORM_STATUS.encode(), status.encode()
+    sizes = _METADATA.pack(len(name), _US_ASCII, len(value))
+    return (1).to_bytes(2, "big") + sizes, name + value
 
 
 def encode_header(version: int, message: Message, body: bytes) -> bytes:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -46,15 +47,18 @@ class PoseTrack:
         time: s.
         poses: probe -> tracker, mm.
         valid: False where a pose cannot be used.
-        interval_s: median time between them.
         source: the file.
     """
 
     time: Float[np.ndarray, " m"]
     poses: Float[np.ndarray, "m 4 4"]
     valid: Bool[np.ndarray, " m"]
-    interval_s: float
     source: str
+
+    @cached_property
+    def interval_s(self) -> float:
+        """Median time between two poses."""
+        return float(np.median(np.diff(self.time)))
 
     @property
     def gap_s(self) -> float:
@@ -98,15 +102,7 @@ class PoseTrack:
                 "but differ from it: were times written with too few digits, or poses stamped in "
                 "groups?"
             )
-        interval = float(np.median(np.diff(time[kept])))
-        return cls(time[kept], poses[kept], usable[kept], interval, source)
-
-    @classmethod
-    def of_table(
-        cls, time: Float[np.ndarray, " m"], poses: Float[np.ndarray, "m 4 4"], source: str
-    ) -> PoseTrack:
-        """Poses that can all be used, at times, s, that increase."""
-        return cls(time, poses, np.ones(len(time), bool), float(np.median(np.diff(time))), source)
+        return cls(time[kept], poses[kept], usable[kept], source)
 
     def velocities(self, time: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 6"] | None:
         """How the probe moved at these times (:func:`pose_velocities`); None if it is not known."""

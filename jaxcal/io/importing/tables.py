@@ -90,7 +90,7 @@ def _from_table(table: PoseTable, notes: list[str], lost: int, options: ImportOp
         table, notes = replace(table, time=time), notes + said
         poses = table.poses
         if poses is not None and time is not None and len(time) > 1 and table.velocity is None:
-            track = PoseTrack.of_table(time, poses, table.name)
+            track = PoseTrack(time, poses, np.ones(len(time), bool), table.name)
             table = replace(table, velocity=track.velocities(time))
     with naming_pose_units(options, table.length_stated):
         recording = recording_of(table, options.spacing_mm, options.minimum)
