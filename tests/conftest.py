@@ -6,10 +6,12 @@ import atexit
 import os
 import shutil
 import signal
+import struct
 import subprocess
 import sys
 import tempfile
 import warnings
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -208,6 +210,17 @@ def random_poses(count: int, seed: int | np.random.Generator = 0) -> np.ndarray:
     poses[:, :3, :3] = Rotation.random(count, random_state=seed).as_matrix()
     poses[:, :3, 3] = rng.uniform(-200, 200, (count, 3))
     return poses
+
+
+def png(columns: int, rows: int, data: bytes) -> bytes:
+    """A PNG file of 8 bits that claims this size, whatever its data hold."""
+
+    def chunk(name: bytes, content: bytes) -> bytes:
+        crc = zlib.crc32(name + content)
+        return struct.pack(">I", len(content)) + name + content + struct.pack(">I", crc)
+
+    head = struct.pack(">IIBBBBB", columns, rows, 8, 0, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
 
 
 def angle(first: np.ndarray, second: np.ndarray) -> float:

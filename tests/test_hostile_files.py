@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import struct
 import subprocess
 import sys
 import zlib
@@ -12,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import png
 
 from jaxcal.io.sequence_files import write_sequence
 
@@ -68,17 +68,6 @@ def entities() -> str:
     """A thousand million laughs."""
     laughs = "".join(f'<!ENTITY l{k} "{f"&l{k - 1};" * 10}">' for k in range(1, 10))
     return f'<!DOCTYPE z [<!ENTITY l0 "ha">{laughs}]><PlusConfiguration>&l9;</PlusConfiguration>'
-
-
-def png_bomb() -> bytes:
-    def chunk(name: bytes, content: bytes) -> bytes:
-        return struct.pack(">I", len(content)) + name + content + struct.pack(
-            ">I", zlib.crc32(name + content)
-        )  # fmt: skip
-
-    head = struct.pack(">IIBBBBB", 60_000, 60_000, 8, 0, 0, 0, 0)
-    return (b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head)
-            + chunk(b"IDAT", zlib.compress(bytes(1 << 20))) + chunk(b"IEND", b""))  # fmt: skip
 
 
 TABLE = ["x [mm]", "y [mm]", "z [mm]", "qx", "qy", "qz", "qw", "u", "v"]
@@ -153,7 +142,9 @@ def told(tmp_path_factory):
     add("laughs", "document types", "export", str(folder / "in" / "laughs.xml"), "--slicer",
         str(folder / "laughs.tfm"))  # fmt: skip
     (folder / "in" / "png").mkdir()
-    (folder / "in" / "png" / "a1.png").write_bytes(png_bomb())
+    (folder / "in" / "png" / "a1.png").write_bytes(
+        png(60_000, 60_000, zlib.compress(bytes(1 << 20)))
+    )
     add("png", "claims", "import", str(folder / "in" / "png"), str(folder / "png.h5"), "--poses",
         str(folder / "in" / "back.csv"))  # fmt: skip
     (folder / "in" / "deep.json").write_text("[" * 10**6)

@@ -6,7 +6,6 @@ import json
 import os
 import re
 import shlex
-import struct
 import warnings
 import zlib
 from dataclasses import replace
@@ -16,6 +15,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from conftest import png
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation, Slerp
@@ -510,15 +510,6 @@ def test_png_of_every_kind(tmp_path, mode):
         Image.fromarray(expected.astype(np.uint8)).convert(mode).save(tmp_path / "a.png")
     assert png_size(tmp_path / "a.png") == (17, 12)
     np.testing.assert_array_equal(read_png(tmp_path / "a.png"), expected)
-
-
-def png(columns: int, rows: int, data: bytes) -> bytes:
-    def chunk(name: bytes, content: bytes) -> bytes:
-        crc = zlib.crc32(name + content)
-        return struct.pack(">I", len(content)) + name + content + struct.pack(">I", crc)
-
-    head = struct.pack(">IIBBBBB", columns, rows, 8, 0, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
 
 
 @pytest.mark.parametrize(

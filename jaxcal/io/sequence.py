@@ -65,17 +65,15 @@ class Pixels:
 
 @dataclass(frozen=True)
 class Hdf5Pixels:
-    """Pixels in a dataset (n, rows, columns) of uint8, MF-oriented.
+    """Pixels in the dataset ``/frames`` (n, rows, columns) of uint8, MF-oriented.
 
     Attributes:
         path: of the HDF5 file.
-        dataset: its name in the root.
         columns: of a frame, px.
         rows: of a frame, px.
     """
 
     path: Path
-    dataset: str
     columns: int
     rows: int
 
@@ -286,10 +284,10 @@ def _hdf5_images(
     from jaxcal.io.untrusted import child, open_root, row
 
     with naming(source), open_root(pixels.path) as root:
-        node = child(root, pixels.dataset)
+        node = child(root, "frames")
         for number in numbers:
             if node is None:
-                raise FormatError(f"/{pixels.dataset} is missing")
+                raise FormatError("/frames is missing")
             yield oriented(row(node, number), orientation)
 
 

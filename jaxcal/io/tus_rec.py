@@ -61,14 +61,13 @@ def read_scan(path: str | os.PathLike[str]) -> TrackedSequence:
             count, rows, columns = check_rows(frames, 3, LARGEST_FRAME, "u")
             if count != len(poses):
                 raise FormatError(f"/frames has {count} frames, /tforms {len(poses)}")
-            pixels = Hdf5Pixels(Path(path), "frames", columns, rows)
-        count = len(poses)
+            pixels = Hdf5Pixels(Path(path), columns, rows)
         valid = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
         return TrackedSequence(
             {FRAMES: poses},
             {FRAMES: valid},
-            np.full(count, np.nan),
-            np.full(count, pixels is not None),
+            np.full(len(poses), np.nan),
+            np.full(len(poses), pixels is not None),
             pixels,
             os.fspath(path),
         )
