@@ -113,11 +113,7 @@ class Columns:
 def names_columns(cells: list[str]) -> bool:
     """Whether most of the cells are names of columns, rather than words of a sentence."""
     bases = [_split(cell)[0] for cell in cells]
-    known = [
-        base
-        for base in bases
-        if base in _ROLE or _CELL.fullmatch(base) or _NUMBERED.fullmatch(base)
-    ]
+    known = [b for b in bases if b in _ROLE or _CELL.fullmatch(b) or _NUMBERED.fullmatch(b)]
     return 2 * len(known) > len(cells)
 
 

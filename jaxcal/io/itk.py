@@ -141,10 +141,9 @@ def read_itk(path: str | os.PathLike[str]) -> Float[np.ndarray, "4 4"]:
     Raises:
         FormatError: not such a file, more than one transform, or another kind of transform.
     """
-    name = os.fspath(path)
     check_readable(path)
     with naming(path):
-        if Path(name).suffix.lower() == ".h5":
+        if Path(path).suffix.lower() == ".h5":
             with open_root(path) as root:
                 return matrix_from_itk(*_read_hdf5(root))
         return matrix_from_itk(*_read_text(path))

@@ -148,7 +148,11 @@ def read_pose_table(
             raise FormatError("its poses are matrices: leave --quaternion out")
         needed = replace(columns, time=None, nanoseconds=None) if ignore_time else columns
         rows, skipped = _used_rows(table, needed, skip_invalid)
-        unit = _agreed(units, columns.point_unit)
+        if units is not None and columns.point_unit not in (None, units):
+            raise FormatError(
+                f"the header says that points are in {columns.point_unit}, not {units}"
+            )
+        unit = columns.point_unit or units or "px"
         points = None if columns.point is None else table.numbers(columns.point, rows)
         if points is not None and unit != "px":
             points *= LENGTHS_MM[unit]
@@ -506,12 +510,6 @@ def _poses(
     quaternions = table.numbers(columns.quaternion, rows)
     turns = rotations_from_quaternions(quaternions, "xyzw", labels=labels)
     return matrices_from_rotations(turns, table.numbers(columns.translation, rows) * factor)
-
-
-def _agreed(asked: PointUnit | None, stated: str | None) -> str:
-    if asked is not None and stated not in (None, asked):
-        raise FormatError(f"the header says that points are in {stated}, not {asked}")
-    return stated or asked or "px"
 
 
 def _whole_numbers(table: Table, column: int, rows: list[int]) -> Int[np.ndarray, " n"]:

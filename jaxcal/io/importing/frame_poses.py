@@ -248,8 +248,5 @@ def _chosen_frames(sequence: TrackedSequence, options: ImportOptions) -> tuple[s
         of_stylus = "Stylus" in pair and start != "Stylus" and not set(resting).isdisjoint(pair)
         if of_stylus and 2 * sequence.valid[pair].sum() > len(sequence):
             tip = "; --to Stylus if its tip is the target"
-    return (
-        start,
-        end,
-        [f"poses from {start} to {end}{how} (--from and --to choose others{tip}){lost}"],
-    )
+    told = f"poses from {start} to {end}{how} (--from and --to choose others{tip}){lost}"
+    return start, end, [told]
