@@ -171,14 +171,14 @@ def _read(source: str | os.PathLike[str] | io.BytesIO, name: str) -> Recording:
         if calibration is None:
             raise FormatError("has no /calibration: there are no images to calibrate with")
         selected = _read_images(calibration, probe, MINIMUM_IMAGES)
-        source, target = (text(calibration, attribute) for attribute in _POSE_FRAMES)
+        start, end = (text(calibration, attribute) for attribute in _POSE_FRAMES)
         return Recording(
             calibration=selected,
             test=None if test is None else _read_images(test, probe, minimum=1),
             truth=None if truth is None else _read_truth(truth, len(selected)),
             probe=probe,
             source=name,
-            pose_frames=None if source is None or target is None else (source, target),
+            pose_frames=None if start is None or end is None else (start, end),
         )
 
 

@@ -507,9 +507,10 @@ def _poses(
         return check_poses(matrices, labels=labels)
     if columns.translation is None or columns.quaternion is None:
         return None
+    translations = table.numbers(columns.translation, rows) * factor
     quaternions = table.numbers(columns.quaternion, rows)
     turns = rotations_from_quaternions(quaternions, "xyzw", labels=labels)
-    return matrices_from_rotations(turns, table.numbers(columns.translation, rows) * factor)
+    return matrices_from_rotations(turns, translations)
 
 
 def _whole_numbers(table: Table, column: int, rows: list[int]) -> Int[np.ndarray, " n"]:
