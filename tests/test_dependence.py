@@ -65,8 +65,9 @@ def test_a_hold_is_one_image_with_its_mean(frames, holds, each):
 def test_frames_of_frozen_tracking_are_left_out(frames):
     made = frames.held(30, 1, np.random.default_rng(4))
     poses, points = made.poses.copy(), made.points.copy()
-    # Frozen for three images; and a robot's hold, with a wrong click.
+    # Frozen for three images, the last one as a filter leaves it; a robot's hold, a wrong click.
     poses[8:10] = poses[7]
+    poses[9, :3, 3] += 0.02
     poses[20:25], points[20:25] = poses[20], points[20]
     points[22] += 20.0
     problem = jaxcal.Problem.from_arrays(poses, points)

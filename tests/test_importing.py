@@ -174,10 +174,11 @@ def test_invalid_rows_are_counted(tmp_path):
     np.testing.assert_array_equal(recording.calibration.frame, np.arange(1, 7))
 
 
-def test_a_pose_of_zeros_is_that_of_a_tool_not_seen(tmp_path):
+@pytest.mark.parametrize("number", ["0", "-3.697314E28"])
+def test_a_pose_of_zeros_or_of_ndi_s_mark_is_that_of_a_tool_not_seen(tmp_path, number):
     lines = table(NAMES, COLUMNS)
     cells = lines[3].split(",")
-    lost = ",".join([*cells[:2], *["0"] * (len(cells) - 2)])
+    lost = ",".join([*cells[:2], *[number] * (len(cells) - 2)])
     with pytest.raises(FormatError, match=r"t\.csv:8: the rotation is all zeros.*--skip-invalid"):
         imported(tmp_path, [*lines, lost])
     assert len(imported(tmp_path, [*lines, lost], skip_invalid=True).recording) == 6

@@ -15,9 +15,9 @@ point (the median from five frames on, so one wrong click in a hold does no harm
 those *between* holds, which the solver estimates from the holds' residuals; they include what the
 mean leaves of the errors *within* a hold. The other frames of a group are masked out.
 
-*Frozen tracking.* Many trackers repeat the last pose while the tool is not seen. Frames with
-exactly the same pose, in which the target lies in different places, have a wrong pose and are left
-out.
+*Frozen tracking.* Many trackers repeat the last pose while the tool is not seen; filters and
+interpolation between poses change it slightly. Frames whose poses differ by at most ``FROZEN_MM``,
+in which the target lies in different places, have a wrong pose and are left out.
 
 *Streams.* Images of a moving probe may differ in pose and still share slowly changing errors. The
 residuals of the conventional fit (closed form, :mod:`jaxcal.solvers.closed_form.single`) have an
@@ -60,6 +60,9 @@ HOLD_MM = 3.0
 
 MEDIAN_FROM = 5
 """From so many frames on, the point of a group is the median of its frames' points."""
+
+FROZEN_MM = 0.1
+"""Poses that are nearer than this to each other may be repetitions of one."""
 
 MOVED_SHARE = 0.25
 """Frames of one pose contradict it if their points differ by more than this share of the spread of
@@ -128,9 +131,9 @@ class IndependentImages:
         if self.frozen:
             named = ", ".join(map(str, self.frozen[:10])) + ", ..." * (len(self.frozen) > 10)
             told.append(
-                f"left out {len(self.frozen)} images, counted from 0, whose pose is exactly "
-                "that of another one while the target moves in them (was tracking frozen?): "
-                f"{named}"
+                f"left out {len(self.frozen)} images, counted from 0, whose pose is that of "
+                f"another one (within {FROZEN_MM:g} mm) while the target moves in them (was "
+                f"tracking frozen?): {named}"
             )
         if self.stride > 1:
             alike = self.alike * self.frames / self.poses
@@ -168,9 +171,11 @@ def independent(
         InputError: fewer than 4 different poses.
     """
     poses, mask = np.asarray(problem.poses, dtype=float), np.asarray(problem.mask) > 0
-    frozen = _frozen(poses, np.asarray(problem.measurements, dtype=float), mask)
-    mask = mask & ~frozen
     group = same_pose(poses, mask)
+    frozen = _frozen(poses, np.asarray(problem.measurements, dtype=float), group)
+    if frozen.any():
+        mask = mask & ~frozen
+        group = same_pose(poses, mask)
     found = replace(_representatives(group, mask), frozen=tuple(np.flatnonzero(frozen).tolist()))
     if found.poses < MINIMUM_IMAGES:
         left_out = f" ({found.words[0]})" if found.frozen else ""
@@ -286,18 +291,24 @@ def _ends_of_runs(label: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
 def _frozen(
     poses: Float[np.ndarray, "n 4 4"],
     points: Float[np.ndarray, "n 2"],
-    mask: Bool[np.ndarray, " n"],
+    group: Int[np.ndarray, " n"],
 ) -> Bool[np.ndarray, " n"]:
-    """Frames that have exactly one pose, while the target lies in different places in them."""
-    used, frozen = np.flatnonzero(mask), np.zeros(len(mask), bool)
+    """Frames that repeat one pose, while the target lies in different places in them."""
+    used, frozen = np.flatnonzero(group >= 0), np.zeros(len(group), bool)
     if not len(used):
         return frozen
     limit = max(MOVED_SHARE * np.sqrt(points[used].var(axis=0).sum()), LEAST_MOVED)
-    each = np.unique(poses[used].reshape(len(used), 16), axis=0, return_inverse=True)[1]
-    for rows in map(used.__getitem__, _members(each.ravel())):
-        away = np.linalg.norm(points[rows] - np.median(points[rows], axis=0), axis=1)
+
+    def apart(rows: Int[np.ndarray, " m"]) -> bool:
         # One wrong click does no harm where the hold's point is a median.
-        frozen[rows] = (np.median(away) if len(rows) >= MEDIAN_FROM else away.max()) > limit
+        away = np.linalg.norm(points[rows] - np.median(points[rows], axis=0), axis=1)
+        return bool((np.median(away) if len(rows) >= MEDIAN_FROM else away.max()) > limit)
+
+    for rows in map(used.__getitem__, _members(group[used])):
+        while len(rows) and apart(rows):
+            near = displacement(poses[rows], poses[rows[:1]]) <= FROZEN_MM
+            frozen[rows[near]] = apart(rows[near])
+            rows = rows[~near]
     return frozen
 
 

@@ -22,6 +22,8 @@ _NUMBER = re.compile(
     r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?|[-+]?(?:nan|inf(?:inity)?)", re.I
 )
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
+ABSENT = -1e20
+"""A number below this is missing: NDI writes -3.697314E28 in its place."""
 MOST_ROWS = 1_000_000
 """Most rows of a table, a quarter of an hour at 1 kHz."""
 _STATED_SEPARATOR = re.compile(r'"?sep=([;,\t])"?[;,\t]*', re.I)

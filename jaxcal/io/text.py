@@ -25,7 +25,7 @@ from jaxcal.data.recording import MINIMUM_IMAGES, Recording, make_images
 from jaxcal.io.columns import CONVERT, LENGTHS_MM, Columns, columns_of_header
 from jaxcal.io.given_files import naming
 from jaxcal.io.lines import text_lines
-from jaxcal.io.table import Table, first_line, parse_numbers, read_table
+from jaxcal.io.table import ABSENT, Table, first_line, parse_numbers, read_table
 from jaxcal.runtime.array_types import Float, Int
 from jaxcal.runtime.messages import counted, quoted
 
@@ -461,8 +461,8 @@ def _used_rows(
             why = f"the row is marked as invalid ({quoted(cells[columns.valid])})"
         elif missing is not None:
             why = f"{table.column(missing)} is {quoted(cells[missing])[1:-1] or 'empty'}"
-        elif set(parse_numbers([cells[k] for k in pose], decimal_comma=comma)) == {0.0}:
-            why = "the rotation is all zeros, as of a tool that was not seen"
+        elif _not_seen(parse_numbers([cells[k] for k in pose], decimal_comma=comma)):
+            why = "the rotation is all zeros or -3.7e28, as of a tool that was not seen"
         else:
             kept.append(row)
             continue
@@ -472,6 +472,10 @@ def _used_rows(
     if not kept:
         raise FormatError(f"all {len(table.rows)} rows are marked as invalid")
     return kept, tuple(skipped)
+
+
+def _not_seen(rotation: list[float | None]) -> bool:
+    return set(rotation) == {0.0} or any(each is not None and each < ABSENT for each in rotation)
 
 
 def _first_missing(cells: list[str], columns: list[int]) -> int | None:

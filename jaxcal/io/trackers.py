@@ -23,15 +23,13 @@ from jaxcal.io.frame_names import FramePair
 from jaxcal.io.given_files import naming
 from jaxcal.io.lines import cells_of, text_lines
 from jaxcal.io.sequence import TrackedSequence
-from jaxcal.io.table import parse_number
+from jaxcal.io.table import ABSENT, parse_number
 from jaxcal.runtime.messages import quoted
 
 TRACKER = "Tracker"
 _BEGINNING = re.compile(r"(Tools|Format Version)\s*[,;\t]")
 MOST_POSES = 1_000_000
 """Of all tools in all rows."""
-_ABSENT = -1e20
-"""A number below this is missing: NDI writes -3.697314E28 in its place."""
 _UNITS: dict[str, LengthUnit] = {"meters": "m", "centimeters": "cm", "millimeters": "mm"}
 """What Motive calls them."""
 
@@ -146,7 +144,7 @@ def _numbers(cells: list[str], columns: list[int], line: int) -> list[float] | N
         value = parse_number(text)
         if value is None:
             raise FormatError(f"line {line}: column {column + 1} is not a number: {quoted(text)}")
-        if not math.isfinite(value) or value < _ABSENT:
+        if not math.isfinite(value) or value < ABSENT:
             return None
         values.append(value)
     return values

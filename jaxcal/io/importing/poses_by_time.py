@@ -22,12 +22,13 @@ from jaxcal.data.timing import (
 from jaxcal.io.sequence import TrackedSequence
 from jaxcal.io.text import PoseTable
 from jaxcal.runtime.array_types import Bool, Float
-from jaxcal.runtime.messages import seconds
+from jaxcal.runtime.messages import counted, seconds
 
 LONGEST_GAP = 5.0
 """Longest time between two poses that is bridged, in median intervals."""
 _SHORT = 0.02
-"""Images of less than this part of the tracking make one ask for the unit of its times."""
+"""Images of less than this part of the tracking make one ask for the unit of its times, as does
+tracking of less than this part of the images."""
 _SHARED = 0.2
 """Largest share of poses with the time stamp of another; stamps that are rounded to 1.25 intervals
 between poses give this share."""
@@ -193,12 +194,14 @@ def with_poses_by_time(
     time, poses, valid, gap = track.time, track.poses, track.valid, track.gap_s
     asked = _within(images.time - lag_s, time[valid])
     between = can_interpolate(time, asked, max_gap_s=gap, valid=valid)
-    if not between.any():
+    too_long = len(images) > 1 and np.ptp(asked) * _SHORT > time[-1] - time[0]
+    if too_long or not between.any():
         raise InputError(
-            f"{images.source}: no image lies between poses of {track.source}: images are from "
-            f"{seconds(asked.min())} to {seconds(asked.max())}, poses from {seconds(time[0])} to "
-            f"{seconds(time[-1])}: do they use the same clock, and "
-            "seconds (milliseconds are read from a column 'time (ms)')?"
+            f"{images.source}: {between.sum() or 'none'} of {counted(len(images), 'image')} lies "
+            f"between poses of {track.source}: images are from {seconds(asked.min())} to "
+            f"{seconds(asked.max())}, poses from {seconds(time[0])} to {seconds(time[-1])}: do "
+            "they use the same clock, and seconds (milliseconds are read from a column "
+            "'time (ms)')?"
         )
     found = np.full((len(images), 4, 4), np.nan)
     found[between] = interpolate_poses(time, poses, asked[between], max_gap_s=gap, valid=valid)
