@@ -141,6 +141,21 @@ def test_points_of_other_images_do_not_fit_together(slips):
     assert "do not fit together" in said
 
 
+@pytest.mark.parametrize("count", [1, 5])
+@pytest.mark.parametrize("unit", ["mm", "px, known", "px, unknown"])
+def test_a_few_poses_of_a_tool_not_seen_are_no_other_mistake(slips, count, unit):
+    """One pose at the tracker's origin looked like lists that are 20 rows out of step."""
+    for number in range(2):
+        images = slips.recorded(number, unit).images()
+        poses = images.poses.copy()
+        poses[:, :3, 3] += [100.0, -50.0, -1500.0]
+        poses[np.random.default_rng(number).permutation(len(poses))[:count]] = np.eye(4)
+        said = wrong_frames(Problem.from_recording(replace(images, poses=poses)))
+        assert said is not None
+        assert said.startswith(f"{count} of {len(poses)} images that were compared do")
+        assert "--robust" in said
+
+
 def test_a_wrong_spacing_is_told_with_the_right_one(slips):
     right = slips.recorded(5, "px, known")
     said = wrong_frames(Problem.from_recording(replace(right, spacing=(0.14, 0.12)).images()))

@@ -96,6 +96,9 @@ UNFIT, UNFIT_MM = 0.5, 5.0
 """Images do not fit together if their median error exceeds both this share of the target's motion
 and this length. Even a third of wrong images does not raise the median so far."""
 
+TRIMMED_FITS = 3
+"""Fits to the two thirds of the images with the least errors, which show whether few are wrong."""
+
 UNITS = {1000.0: "metres", 100.0: "dm", 25.4: "inches", 10.0: "cm"}
 """Units that may be mistaken for mm; the keys are their lengths in mm."""
 
@@ -132,13 +135,19 @@ def wrong_frames(problem: Problem, estimate: tuple[str, ...] = ()) -> str | None
         squares = other.squares * count / other.reduced.images
         if squares < best and _credible(other.scales, images, known):
             best, told, least = squares, words, factor
-    if told is not None and _far_better(before, best, count, least):
+    if not _far_better(before, best, count, least):
+        told = None
+    unfit = _is_overdetermined(count) and apart > max(UNFIT_MM, UNFIT * extent)
+    # Where a few images spoil the fit to all, a wrong correction may seem to be right.
+    if (told or unfit) and (few := _few_wrong(given, fit, best)):
+        return few
+    if told is not None:
         return _sentence(told, before, best, count)
     if known and not {"scale", "sound-speed"} & set(estimate):
         told = _wrong_scale(given, fit)
         if told is not None:
             return told
-    if _is_overdetermined(count) and apart > max(UNFIT_MM, UNFIT * extent):
+    if unfit:
         return (
             f"the images do not fit together (typical error {_mm(apart)}, of a target that moves "
             f"by {_mm(extent)} in them): do poses and points belong together, with times of one "
@@ -157,6 +166,32 @@ def wrong_frames(problem: Problem, estimate: tuple[str, ...] = ()) -> str | None
             " are the poses' translations in mm? (else correct the spacing, or leave it out)"
         )
     return None
+
+
+def _few_wrong(data: ImageData, fit: _Fit, best: float) -> str | None:
+    """What to do where a few images are so wrong that none fits; None where that is not so.
+
+    ``best`` is the least sum of squares with a mistake corrected.
+    """
+    count = len(data.points)
+    if not _is_overdetermined(least := count - count // 3):
+        return None
+    found: _Fit | None = fit
+    for _ in range(TRIMMED_FITS):
+        kept = np.argsort(_errors(data, found)[0])[:least]
+        part = {name: getattr(data, name)[kept] for name in ("rotations", "translations", "points")}
+        if (found := _free_fit(replace(data, **part))) is None:
+            return None
+    errors = _errors(data, found)[0]
+    rest = float(np.median(errors[kept]))
+    wrong = int((errors > max(UNFIT_MM, FARTHER * rest)).sum())
+    if rest > UNFIT_MM / 2 or not 0 < wrong <= count // 3 or best <= FACTOR * count * rest**2:
+        return None
+    return (
+        f"{wrong} of {count} images that were compared {'do' if wrong > 1 else 'does'} not fit the "
+        f"others, which fit each other (typical error {_mm(rest)}): is it the pose of a tool that "
+        "was not seen? A robust solve (--robust) leaves such images out"
+    )
 
 
 def doubtful_unit(problem: Problem) -> str | None:
@@ -263,11 +298,17 @@ def _free_fit(data: ImageData) -> _Fit | None:
 
 def _typical_error(data: ImageData, fit: _Fit) -> tuple[float, float]:
     """Median error of the images under a fit, and the target's motion in them, mm."""
+    errors, extent = _errors(data, fit)
+    return float(np.median(errors)), extent
+
+
+def _errors(data: ImageData, fit: _Fit) -> tuple[Float[np.ndarray, " n"], float]:
+    """Error of every image under a fit, and the target's motion in them, mm."""
     origin, target = fit.reduced.origin_and_target(fit.x)
     seen = data.points @ fit.x.reshape(2, 3)
     cloud = np.einsum("nij,nj->ni", data.rotations, seen + origin) + data.translations
     extent = float(np.sqrt(np.mean(np.sum((seen - seen.mean(axis=0)) ** 2, axis=1))))
-    return float(np.median(np.linalg.norm(cloud - target, axis=1))), extent
+    return np.linalg.norm(cloud - target, axis=1), extent
 
 
 def _far_better(before: float, after: float, count: int, factor: float = FACTOR) -> bool:
