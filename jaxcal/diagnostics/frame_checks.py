@@ -176,12 +176,14 @@ def _few_wrong(data: ImageData, fit: _Fit, best: float) -> str | None:
     count = len(data.points)
     if not _is_overdetermined(least := count - count // 3):
         return None
-    found: _Fit | None = fit
+    found, kept = fit, np.arange(count)
     for _ in range(TRIMMED_FITS):
         kept = np.argsort(_errors(data, found)[0])[:least]
         part = {name: getattr(data, name)[kept] for name in ("rotations", "translations", "points")}
-        if (found := _free_fit(replace(data, **part))) is None:
+        refit = _free_fit(replace(data, **part))
+        if refit is None:
             return None
+        found = refit
     errors = _errors(data, found)[0]
     rest = float(np.median(errors[kept]))
     wrong = int((errors > max(UNFIT_MM, FARTHER * rest)).sum())
@@ -189,8 +191,8 @@ def _few_wrong(data: ImageData, fit: _Fit, best: float) -> str | None:
         return None
     return (
         f"{wrong} of {count} images that were compared {'do' if wrong > 1 else 'does'} not fit the "
-        f"others, which fit each other (typical error {_mm(rest)}): is it the pose of a tool that "
-        "was not seen? A robust solve (--robust) leaves such images out"
+        f"others, which fit each other (typical error {_mm(rest)}): a tool that was not seen, or "
+        "another target? A robust solve (--robust) leaves such images out"
     )
 
 
