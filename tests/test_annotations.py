@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import inspect
+from dataclasses import dataclass
 from pathlib import Path
 from typing import get_type_hints
 
@@ -12,6 +13,8 @@ import numpy as np
 import optimistix as optx
 import pytest
 import xarray
+from beartype.roar import BeartypeDoorHintViolation
+from jaxtyping import Float
 from matplotlib.figure import Figure
 
 import jaxcal
@@ -65,3 +68,31 @@ def test_annotations_of_public_names_can_be_evaluated(module):
     for name in dir(module):
         for each in readable(getattr(module, name)):
             get_type_hints(each, localns=late)
+
+
+def test_calls_and_results_are_checked():
+    """Sizes of one name agree within a call, by place, by name, and in the result."""
+
+    @jaxtyping.jaxtyped(typechecker=None)
+    def longer(first: Float[np.ndarray, " n"], *more: int, by: int = 1) -> Float[np.ndarray, "n 2"]:
+        return np.zeros((len(first) + by, 2))
+
+    assert len(longer(np.zeros(3), by=0)) == 3
+    for place, arguments, named in [
+        ("the result", (np.zeros(3),), {}),
+        ("first", (np.zeros((3, 1)),), {"by": 0}),
+        ("an argument", (np.zeros(3), "1"), {"by": 0}),
+        ("by", (), {"first": np.zeros(3), "by": 0.0}),
+    ]:
+        with pytest.raises(BeartypeDoorHintViolation, match=f"longer, {place}: "):
+            longer(*arguments, **named)
+
+    @jaxtyping.jaxtyped(typechecker=None)
+    @dataclass
+    class Two:
+        first: Float[np.ndarray, " n"]
+        second: Float[np.ndarray, " n"]
+
+    assert Two(np.zeros(2), np.zeros(2)).second.size == 2
+    with pytest.raises(BeartypeDoorHintViolation, match="__init__, second: "):
+        Two(np.zeros(2), np.zeros(3))
