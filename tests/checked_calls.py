@@ -15,7 +15,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import is_dataclass
 from types import CodeType, FunctionType
-from typing import Any, ParamSpecArgs, ParamSpecKwargs, get_type_hints
+from typing import Any, ForwardRef, ParamSpecArgs, ParamSpecKwargs, get_type_hints
 
 import jaxtyping
 from beartype.door import die_if_unbearable, is_bearable
@@ -121,10 +121,14 @@ class _Checks:
             read.__annotations__ = {"value": annotation}
             try:
                 hint = get_type_hints(read, where, include_extras=True)["value"]
-                # Those of a function that a decorator is about to call: any.
-                anything = isinstance(hint, (ParamSpecArgs, ParamSpecKwargs))
-                _hints[key] = Any if anything else hint
             # Names for the type checker alone, and those of functions around this one.
             except Exception:
-                _hints[key] = Any
+                hint = Any
+            bound = getattr(hint, "__bound__", None)
+            if isinstance(bound, ForwardRef):
+                hint = self._hint(bound.__forward_arg__)
+            # Arguments of a function that a decorator calls: any.
+            elif isinstance(hint, (ParamSpecArgs, ParamSpecKwargs)):
+                hint = Any
+            _hints[key] = hint
         return _hints[key]
