@@ -18,7 +18,7 @@ from types import CodeType, FunctionType
 from typing import Any, ForwardRef, ParamSpecArgs, ParamSpecKwargs, get_type_hints
 
 import jaxtyping
-from beartype.door import die_if_unbearable, is_bearable
+from beartype.door import is_bearable
 
 CHECKED_CALLS = 10
 """In each test so many calls of every function are checked."""
@@ -103,10 +103,9 @@ class _Checks:
             self.value(name, value, self.by_name.get(name, self.other_names))
 
     def value(self, name: str, value: Any, hint: Any) -> None:
-        if hint is Any or is_bearable(value, hint):
-            return
-        where = f"{self.function.__module__}.{self.function.__qualname__}, {name}: "
-        die_if_unbearable(value, hint, exception_prefix=where)
+        if hint is not Any and not is_bearable(value, hint):
+            where = f"{self.function.__module__}.{self.function.__qualname__}"
+            raise jaxtyping.TypeCheckError(f"{where}, {name}: {repr(value)[:200]} is no {hint}")
 
     def _hint(self, annotation: Any) -> Any:
         """What an annotation means in the function's module; Any where it has no meaning there."""

@@ -98,6 +98,11 @@ from jaxcal.runtime import executables
 # who have 32. Not by the environment: processes that the tests start are users'.
 jax.config.update("jax_enable_x64", True)
 
+# Of 1,700 programs that tests asked JAX's cache for in their own process it had none: each module
+# compiles others. To keep one takes 3 % of the time of compiling it. Processes that the tests start
+# share what they keep, and jaxcal's own programs are kept anyway.
+jax.config.update("jax_enable_compilation_cache", False)
+
 # An example may take as long as the machine needs. By default the examples are the same in every
 # run, so that a failure comes from a change; ``--hypothesis-profile=new-examples`` draws others.
 hypothesis.settings.register_profile(

@@ -467,7 +467,7 @@ def test_record_and_table_begin_with_the_error_at_the_image(record, result):
 
 def test_shares_of_a_conventional_fit_are_those_of_its_own_response():
     """Each error of each image is made in turn, in exact data, and the fit is repeated."""
-    recording = jaxcal.simulate_recording(jaxcal.Protocol(images=24, test_images=0), 3)
+    recording = jaxcal.simulate_recording(jaxcal.Protocol(images=24), 3)
     result = jaxcal.calibrate(recording, "conventional")
     told = record_of(result)["limits"]["error_share"]
     x, target = (np.asarray(each) for each in (result.image_to_probe, result.point))

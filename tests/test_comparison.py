@@ -268,9 +268,7 @@ def test_calibrations_of_other_images_of_one_probe_agree(tmp_path, capsys):
     """As a person makes them; ``calibrate --out`` says where the image was used."""
     from jaxcal.data.problem import taken
 
-    whole = jaxcal.Problem.from_recording(
-        jaxcal.simulate_recording(jaxcal.Protocol(images=24, test_images=0), 3)
-    )
+    whole = jaxcal.Problem.from_recording(jaxcal.simulate_recording(jaxcal.Protocol(images=24), 3))
     names = []
     for half in (range(0, 24, 2), range(1, 24, 2)):
         names.append(str(tmp_path / f"{half.start}.json"))

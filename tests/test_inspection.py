@@ -157,10 +157,10 @@ def test_an_image_whose_range_is_off_is_a_suspect():
 
 def test_images_that_are_as_noisy_as_their_covariances_say_are_no_outliers():
     """Every third image is ten times as noisy; a wrong click is still named."""
-    data = problem(5, images=48, elevation_mm=0.5, noise_mm=0.5)
-    noisy = np.arange(48) % 3 == 0
+    data = problem(5, images=50, elevation_mm=0.5, noise_mm=0.5)
+    noisy = np.arange(50) % 3 == 0
     sd = np.where(noisy, 10.0, 1.0)[:, None] * np.array([0.2, 0.1])
-    points = np.array(data.measurements) + sd * np.random.default_rng(5).normal(size=(48, 2))
+    points = np.array(data.measurements) + sd * np.random.default_rng(5).normal(size=(50, 2))
     covariance = jnp.asarray(sd[:, :, None] ** 2 * np.eye(2))
     data = replace(data, measurements=jnp.asarray(points))
     # With common SDs nothing is known of them, and some stand out.

@@ -139,7 +139,7 @@ def test_a_narrow_cone_is_weak_but_solved():
 
 def test_sds_that_determine_nothing_to_rounding_are_told():
     """The status was ``converged`` beside a covariance of NaN, or one far too small."""
-    data = problem(3, images=16, noise_mm=0.1)
+    data = problem(3, images=12, noise_mm=0.1)
     for size in (1e6, 1e7):
         result = jaxcal.calibrate(data, prior="gaussian", sigma=(1 / size, 1 / size, size))
         assert result.status == "unobservable"
