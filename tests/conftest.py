@@ -233,10 +233,12 @@ def angle(first: np.ndarray, second: np.ndarray) -> float:
 
 
 LONGEST = (
-    "test_guest",
     "test_acquire",
+    "test_unmodelled",
     "test_cli",
+    "test_guest",
     "test_study",
+    "test_dependence",
     "test_free_hand",
     "test_solvers",
     "test_design",
@@ -257,7 +259,6 @@ LONGEST = (
     "test_segmentation_image",
     "test_closed_form",
     "test_pivot",
-    "test_unmodelled",
     "test_stream",
     "test_importing_frames",
     "test_observability_sets",
@@ -265,7 +266,6 @@ LONGEST = (
     "test_golden",
     "test_python_answer",
     "test_simulation",
-    "test_dependence",
     "test_executables",
     "test_files",
 )
