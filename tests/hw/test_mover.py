@@ -9,6 +9,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from types import FrameType
@@ -256,6 +257,24 @@ def test_a_kick_that_hangs_ends_the_process_as_any_command_does(monkeypatch):
         be_prompt(0)
     assert 0.0 < left[0] <= 0.4
     assert signal.getitimer(signal.ITIMER_REAL)[0] == 0.0
+
+
+def test_the_alarm_rings_though_a_caller_has_it_ignored_and_blocked():
+    """What it starts inherits both: a command that hangs was ended two seconds later, or never."""
+
+    def deaf() -> None:
+        signal.signal(signal.SIGALRM, signal.SIG_IGN)
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGALRM, signal.SIGTERM})
+
+    start = [sys.executable, "-m", "hw.robot.mover"]
+    with subprocess.Popen(start, stdin=subprocess.PIPE, preexec_fn=deaf) as mover:
+        deadline = time.monotonic() + 60.0
+        # It waits for its setup; until it listens, nothing rings.
+        while mover.poll() is None and time.monotonic() < deadline:
+            mover.send_signal(signal.SIGALRM)
+            time.sleep(0.02)
+        mover.kill()
+    assert mover.returncode == -signal.SIGALRM
 
 
 def test_a_name_with_several_addresses_is_reached_at_the_one_that_answers(monkeypatch):

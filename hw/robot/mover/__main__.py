@@ -20,6 +20,10 @@ from hw.runtime.processes import ASKS, be_prompt
 
 def main() -> NoReturn:
     """Move until the caller closes the input, or motion ends."""
+    # A caller may have signals ignored or blocked, which is inherited: no command that hangs would
+    # end then.
+    signal.signal(signal.SIGALRM, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGALRM, *ENDING))
     caller = Caller(0, os.dup(1))
     # ur_rtde prints; only answers may go to the pipe that the caller reads.
     null = os.open(os.devnull, os.O_WRONLY)
