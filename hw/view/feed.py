@@ -38,105 +38,14 @@ _LINES = 5
 
 
 class Audience:
-    """Is told of the progress of an acquisition, and ignores it; see :class:`LiveView`."""
+    """Keeps what an acquisition tells of its progress; :class:`LiveView` shows it."""
 
-    def plan(
-        self,
-        setup: Setup,
-        plan: MotionPlan,
-        targets: Float[np.ndarray, "n 4 4"],
-        done: list[int],
-        images: int | None = None,
-    ) -> None:
-        """What shall be acquired: all poses, the rows that a resumed recording has, most images."""
-
-    def watch(self, session: Session | None) -> None:
-        """Show the poses and frames of this session; None: show them no longer."""
-
-    def going(self, row: int) -> None:
-        """The robot travels to a pose of the plan."""
-
-    def stop(self, offset_mm: float, amplitude: float, threshold: int) -> None:
-        """The search listened somewhere."""
-
-    def taken(self, row: int, placement: Placement, answer: Calibration | None) -> None:
-        """An image was taken, and this is the estimate now."""
-
-    def given_up(self, row: int) -> None:
-        """No mid-plane was found there, or the operator skipped it."""
-
-
-@contextmanager
-def watched(view: Audience, session: Session) -> Iterator[None]:
-    """Show a session's poses and frames as long as it is open."""
-    view.watch(session)
-    try:
-        yield
-    finally:
-        view.watch(None)
-
-
-class LiveView(Audience):
-    """The live view of one acquisition; a context manager.
-
-    Args:
-        say: told the address, and once that the viewer is gone.
-        port: of the page; another one is taken if it is not free.
-        rate_hz: messages a second.
-
-    Attributes:
-        url: of the page.
-        pid: of the viewer's process.
-        sent: messages.
-        left_out: messages not made because the pipe had not taken the one before.
-        seconds: CPU time of the feeding thread.
-
-    Raises:
-        InputError: viser is not installed, or the viewer does not start; one line.
-    """
-
-    def __init__(
-        self, say: Callable[[str], None], port: int = 8080, rate_hz: float = RATE_HZ
-    ) -> None:
-        cure = missing("viser", extra="view")
-        if cure is not None:
-            raise InputError(f"--view: {cure}")
-        self._say, self._period_s = say, 1.0 / rate_hz
-        self._process = spawn("hw.view.server", str(port), stdin=True)
-        self.pid = self._process.pid
-        self.url = self._greeting()
-        assert self._process.stdin is not None
-        self._pipe = self._process.stdin.fileno()
-        os.set_blocking(self._pipe, False)
-        self.sent = self.left_out = 0
-        self.seconds = 0.0
+    def __init__(self) -> None:
         self._lock = threading.Lock()
         self._session: Session | None = None
         self._slow: dict[str, Any] = {"done": [], "given_up": [], "row": None, "said": []}
         self._said: deque[str] = deque(maxlen=_LINES)
         self._changed = True
-        self._pending = memoryview(b"")
-        self._frame_id: int | None = None
-        self._ending = threading.Event()
-        self._thread = threading.Thread(target=self._feed, daemon=True, name="view")
-        self._thread.start()
-        say(f"view: {self.url} (this machine only; it shows and never moves anything)")
-
-    def __enter__(self) -> LiveView:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """End the viewer's process; safe to repeat."""
-        self._ending.set()
-        self._thread.join()
-        finish(self._process, _END_WALL_S)
-        assert self._process.stdout is not None
-        self._process.stdout.close()
-
-    # What the acquisition tells
 
     def plan(
         self,
@@ -155,7 +64,6 @@ class LiveView(Audience):
             arm=limits.arm_model,
             image_to_probe=np.asarray(scene.image_to_probe, float).ravel().tolist(),
             point=np.asarray(scene.point_mm, float).tolist(),
-            width_mm=float(setup.probe.width_mm),
             done=list(done),
             images=len(targets) if images is None else images,
             given_up=[],
@@ -197,6 +105,73 @@ class LiveView(Audience):
         with self._lock:
             self._slow.update(changes)
             self._changed = True
+
+
+@contextmanager
+def watched(view: Audience, session: Session) -> Iterator[None]:
+    """Show a session's poses and frames as long as it is open."""
+    view.watch(session)
+    try:
+        yield
+    finally:
+        view.watch(None)
+
+
+class LiveView(Audience):
+    """The live view of one acquisition; a context manager.
+
+    Args:
+        say: told the address, and once that the viewer is gone.
+        port: of the page; another one is taken if it is not free.
+        rate_hz: messages a second.
+
+    Attributes:
+        url: of the page.
+        pid: of the viewer's process.
+        sent: messages.
+        left_out: messages not made because the pipe had not taken the one before.
+        seconds: CPU time of the feeding thread.
+
+    Raises:
+        InputError: viser is not installed, or the viewer does not start; one line.
+    """
+
+    def __init__(
+        self, say: Callable[[str], None], port: int = 8080, rate_hz: float = RATE_HZ
+    ) -> None:
+        cure = missing("viser", extra="view")
+        if cure is not None:
+            raise InputError(f"--view: {cure}")
+        super().__init__()
+        self._say, self._period_s = say, 1.0 / rate_hz
+        self._process = spawn("hw.view.server", str(port), stdin=True)
+        self.pid = self._process.pid
+        self.url = self._greeting()
+        assert self._process.stdin is not None
+        self._pipe = self._process.stdin.fileno()
+        os.set_blocking(self._pipe, False)
+        self.sent = self.left_out = 0
+        self.seconds = 0.0
+        self._pending = memoryview(b"")
+        self._frame_id: int | None = None
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._feed, daemon=True, name="view")
+        self._thread.start()
+        say(f"view: {self.url} (this machine only; it shows and never moves anything)")
+
+    def __enter__(self) -> LiveView:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the viewer's process; safe to repeat."""
+        self._ending.set()
+        self._thread.join()
+        finish(self._process, _END_WALL_S)
+        assert self._process.stdout is not None
+        self._process.stdout.close()
 
     # The thread that feeds
 

@@ -21,6 +21,7 @@ import msgspec
 import viser
 from browser import addresses, browsing, pixels
 from motions import PLAN
+from waiting import until
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
@@ -50,13 +51,6 @@ ROOT = Path(__file__).parents[2]
 LIMITS = replace(PLAN.limits, arm_model="")
 SCENE = Scene(np.eye(4), np.array([400.0, -100.0, 0.0]), np.array([0.0, 0.0, -1.0]))
 SETUP = Setup("127.0.0.1", "", SCENE, {}, None, probe=LinearProbe(elements=128), clock=Clock())
-
-
-def wait_until(condition, timeout_s: float = 180.0, every_s: float = 0.02) -> None:
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline, "it did not happen in time"
-        time.sleep(every_s)
 
 
 def listeners(port: int) -> set[str]:
@@ -132,20 +126,20 @@ def test_a_browser_sees_the_bench_move_and_killing_the_view_changes_nothing(tmp_
             return words in browser.execute_script(script)
 
         # At five times its speed the bench takes a core, which the browser needs until here.
-        wait_until(lambda: shows("Waiting for the plan"), every_s=0.1)
+        until(lambda: shows("Waiting for the plan"), every_s=0.1)
         bench = after_loading.enter_context(start(3, 5.0))
         setup = replace(setup_of(bench), extent=near)
         session = after_loading.enter_context(a_session(setup, tmp_path))
         after_loading.enter_context(watched(view, session))
         plan = a_plan(setup, session.poses.identity().name)
         view.plan(setup, plan, plan.targets, [])
-        wait_until(lambda: shows("0 of 5 images"), every_s=0.1)
-        wait_until(lambda: shows("B-mode, newest frame"), every_s=0.1)
+        until(lambda: shows("0 of 5 images"), every_s=0.1)
+        until(lambda: shows("B-mode, newest frame"), every_s=0.1)
         before = pixels(browser)
         view.going(0)
         travel(session, plan, plan.targets[0])
         view.taken(0, PLACEMENT, None)
-        wait_until(lambda: shows("1 of 5 images"), every_s=0.1)
+        until(lambda: shows("1 of 5 images"), every_s=0.1)
         after = pixels(browser)
         # The scene's part of the page: arm, image plane and poses have moved.
         scene = slice(0, int(0.6 * before.shape[1]))
@@ -153,7 +147,7 @@ def test_a_browser_sees_the_bench_move_and_killing_the_view_changes_nothing(tmp_
         assert moved.mean() > 0.01
         assert addresses(browser) <= {"127.0.0.1"}
         os.kill(view.pid, signal.SIGKILL)
-        wait_until(lambda: len(said) > 1)
+        until(lambda: len(said) > 1)
         tracked = travel(session, plan, plan.targets[1])
         assert np.allclose(tracked.pose[:3, 3], plan.targets[1][:3, 3], atol=0.5)
         session.wait_until_clear()
@@ -167,9 +161,9 @@ def test_the_page_is_on_loopback_only(shared_view):
 def test_a_dead_viewer_is_told_once_and_holds_nothing_up():
     said = []
     with LiveView(said.append, port=8191, rate_hz=50.0) as view:
-        wait_until(lambda: view.sent > 2)
+        until(lambda: view.sent > 2)
         os.kill(view.pid, signal.SIGKILL)
-        wait_until(lambda: len(said) > 1)
+        until(lambda: len(said) > 1)
         for row in range(100):
             view.going(row)
             view.say("a line")
@@ -183,7 +177,7 @@ def test_a_feed_that_fails_is_told():
     said = []
     with LiveView(said.append, port=8195, rate_hz=50.0) as view:
         view._session = object()  # type: ignore[assignment]
-        wait_until(lambda: len(said) > 1)
+        until(lambda: len(said) > 1)
     assert said[1].startswith("view: AttributeError: ")
     assert said[1].endswith("; the acquisition goes on without it")
 
@@ -191,20 +185,20 @@ def test_a_feed_that_fails_is_told():
 def test_a_viewer_that_does_not_read_costs_one_message():
     said = []
     with LiveView(said.append, port=8192, rate_hz=50.0) as view:
-        wait_until(lambda: view.sent > 2)
+        until(lambda: view.sent > 2)
         os.kill(view.pid, signal.SIGSTOP)
         try:
             # More than the pipe holds, so that a message stays half handed over.
             for _ in range(20):
                 view.say("x" * 50_000)
                 time.sleep(0.02)
-            wait_until(lambda: view.left_out > 5)
+            until(lambda: view.left_out > 5)
             sent, missed = view.sent, view.left_out
-            wait_until(lambda: view.left_out > missed + 5)
+            until(lambda: view.left_out > missed + 5)
             assert view.sent == sent
         finally:
             os.kill(view.pid, signal.SIGCONT)
-        wait_until(lambda: view.sent > sent + 20)
+        until(lambda: view.sent > sent + 20)
     assert len(said) == 1
     with pytest.raises(ProcessLookupError):
         os.kill(view.pid, 0)
@@ -239,7 +233,7 @@ def test_a_page_can_do_nothing(shared_view):
         assert not before[1]
         socket.send(b"not a message")
     sent = view.sent
-    wait_until(lambda: view.sent > sent + 3)
+    until(lambda: view.sent > sent + 3)
     assert listeners(port_of(view)) == {"0100007F"}
 
 
