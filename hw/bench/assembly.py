@@ -15,11 +15,10 @@ from hw.bench.active_echo import AuspisEmulator
 from hw.bench.arm import Arm
 from hw.bench.control import ControlServer
 from hw.bench.frames import Camera
-from hw.bench.phantoms import phantom_named
 from hw.bench.robot import RobotProcess, model_of
 from hw.bench.rtde import CB_SERIES, E_SERIES
 from hw.bench.ultrasound import ImageServer
-from hw.bench.world import World, make_world
+from hw.bench.world import make_world
 from hw.planning.scene import Scene
 from hw.robot.rtde import nominal_hz
 from hw.runtime.clock import Clock
@@ -98,9 +97,7 @@ class Assembly:
 
     def __init__(self, options: BenchOptions) -> None:
         self.options = options
-        self.world: World = make_world(
-            options.seed, phantom=phantom_named(options.phantom), **options.world
-        )
+        self.world = make_world(options.seed, phantom=options.phantom, **options.world)
         self.clock = Clock(options.speed)
         start = pose_to_ur(hovering(self.world.scene))
         self.arm = Arm(
@@ -153,7 +150,6 @@ class Assembly:
                 "rest_since": self._rest_since,
                 "world": self._world,
                 "test_set": lambda **of: [part.tolist() for part in self.world.test_set(**of)],
-                "statistics": self._statistics,
                 "robot": self._robot,
                 "close": self.end,
             }
@@ -294,17 +290,6 @@ class Assembly:
         assert self.robot is not None
         state = self.robot.state()
         return {name: state[name] for name in ("running", "reason")}
-
-    def _statistics(self) -> dict:
-        assert self.robot is not None
-        robot = self.robot.state()
-        return {
-            "packets": robot["packets"],
-            "packets_skipped": robot["skipped"],
-            "echo_frames": self.echo.sent,
-            "images": self.images.sent,
-            "images_refused": self.images.refused,
-        }
 
 
 def hovering(scene: Scene) -> Float[np.ndarray, "4 4"]:

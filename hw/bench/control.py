@@ -12,12 +12,13 @@ from __future__ import annotations
 import contextlib
 import json
 import socket
+import socketserver
 import threading
 from collections.abc import Callable, Mapping
 from typing import Any
 
 LONGEST_LINE = 1 << 20
-_MOST_CONNECTIONS = 8
+_POLL_S = 0.05
 _TIMEOUT_S = 30.0
 """Wall seconds for connecting and for an answer."""
 
@@ -25,7 +26,15 @@ Handler = Callable[..., object]
 """Takes what stands beside ``do`` in the request, by its names."""
 
 
-class ControlServer:
+class _Connection(socketserver.StreamRequestHandler):
+    def handle(self) -> None:
+        assert isinstance(self.server, ControlServer)
+        with contextlib.suppress(OSError):
+            while (line := self.rfile.readline(LONGEST_LINE)).endswith(b"\n"):
+                self.wfile.write(json.dumps(self.server.answer(line)).encode() + b"\n")
+
+
+class ControlServer(socketserver.ThreadingTCPServer):
     """Answers requests; each connection has a thread.
 
     Args:
@@ -33,50 +42,28 @@ class ControlServer:
             it becomes the error.
     """
 
-    def __init__(self, handlers: Mapping[str, Handler]) -> None:
-        self._handlers = dict(handlers)
-        self._listener = socket.create_server(("127.0.0.1", 0), backlog=_MOST_CONNECTIONS)
-        self.port = int(self._listener.getsockname()[1])
-        self._slots = threading.BoundedSemaphore(_MOST_CONNECTIONS)
-        self._thread = threading.Thread(target=self._accept, name="bench control", daemon=True)
+    daemon_threads = True
 
-    def start(self) -> ControlServer:
+    def __init__(self, handlers: Mapping[str, Handler]) -> None:
+        super().__init__(("127.0.0.1", 0), _Connection)
+        self._handlers = dict(handlers)
+        self.port = int(self.server_address[1])
+        self._thread = threading.Thread(
+            target=self.serve_forever, args=(_POLL_S,), name="bench control", daemon=True
+        )
+
+    def start(self) -> None:
         """Begin to listen."""
         self._thread.start()
-        return self
 
     def stop(self) -> None:
-        """Take no more connections."""
-        with contextlib.suppress(OSError):
-            self._listener.shutdown(socket.SHUT_RDWR)
-        self._listener.close()
+        """Take no more connections; safe to repeat."""
+        if self._thread.is_alive():
+            self.shutdown()
+        self.server_close()
 
-    def _accept(self) -> None:
-        while True:
-            try:
-                connection, _ = self._listener.accept()
-            except OSError:
-                return
-            if not self._slots.acquire(blocking=False):
-                connection.close()
-                continue
-            threading.Thread(target=self._serve, args=(connection,), daemon=True).start()
-
-    def _serve(self, connection: socket.socket) -> None:
-        try:
-            with connection, connection.makefile("rwb") as stream:
-                while True:
-                    line = stream.readline(LONGEST_LINE)
-                    if not line.endswith(b"\n"):
-                        return
-                    stream.write(json.dumps(self._answer(line)).encode() + b"\n")
-                    stream.flush()
-        except OSError:
-            pass
-        finally:
-            self._slots.release()
-
-    def _answer(self, line: bytes) -> dict:
+    def answer(self, line: bytes) -> dict:
+        """What a line is answered by."""
         try:
             request = json.loads(line)
             if not isinstance(request, dict) or request.get("do") not in self._handlers:

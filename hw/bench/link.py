@@ -6,7 +6,6 @@ bound, as in the buffer of a bridge, and refused beyond it.
 
 from __future__ import annotations
 
-import errno
 import os
 import socket
 from abc import ABC, abstractmethod
@@ -93,18 +92,14 @@ class PtyLink(Link):
         self.flush()
         try:
             return os.read(self._master, 4096)
-        except OSError as error:
-            if error.errno in (errno.EAGAIN, errno.EIO):
-                return b""
-            raise
+        except BlockingIOError:
+            return b""
 
     def _send(self, data: bytearray) -> int:
         try:
             return os.write(self._master, data)
-        except OSError as error:
-            if error.errno in (errno.EAGAIN, errno.EIO):
-                return 0
-            raise
+        except BlockingIOError:
+            return 0
 
     def close(self) -> None:
         """See :class:`Link`."""

@@ -145,8 +145,8 @@ class ActiveEcho(Sensor):
     Its answer crosses the beam once, so across the plane its mark in the image is as thick as what
     the electronics hear. It is loud: its reflections show in the image, and a person may take a
     reflection for the element. It is 2 mm wide: the place on it that hears the most moves with the
-    direction of the sound (:meth:`hw.bench.world.World.shift_mm`), and its mark is wider than a
-    point's.
+    direction of the sound (:meth:`hw.bench.tank.Tank.response_shift_mm`), and its mark is wider
+    than a point's.
     """
 
     name = "active-echo"

@@ -49,15 +49,12 @@ class Bench:
         scene: what a person knows.
         probe: the transducer.
         spacing_mm: [lateral, axial] of the images.
-        addresses: all of it, as JSON.
     """
 
     def __init__(self, process: subprocess.Popen, told: dict) -> None:
         self._process = process
-        self.addresses = told
         self.clock = Clock(told["speed"], told["origin_s"])
         self.robot_host = told["robot_host"]
-        self.pose_hz: float = told["pose_hz"]
         self.tcp_offset: tuple[float, ...] = tuple(told["tcp_offset"])
         self.active_echo_url = told["active_echo_url"]
         self.ultrasound: tuple[str, int] = (told["ultrasound"][0], told["ultrasound"][1])
@@ -129,10 +126,6 @@ class Bench:
         """Noise-free in-plane test images: true poses and [lateral, range], mm."""
         poses, points = self._control.ask("test_set", count=count, seed=seed)
         return np.array(poses), np.array(points)
-
-    def statistics(self) -> dict[str, int]:
-        """What was sent: packets, packets_skipped, echo_frames, images, images_refused."""
-        return self._control.ask("statistics")
 
     def robot(self) -> dict[str, object]:
         """``running`` and ``reason``: the controller's program, and why it last stopped."""

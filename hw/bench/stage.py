@@ -48,7 +48,6 @@ class WorldStage:
         position_sd_mm: every stop misses by a normal error of this SD on each axis, which the robot
             does not see.
         backlash_mm: lost motion when the elevational motion changes its direction.
-        pace: how long each action takes.
     """
 
     device: Device = "active echo"
@@ -63,11 +62,10 @@ class WorldStage:
         *,
         position_sd_mm: float = 0.1,
         backlash_mm: float = 0.0,
-        pace: Pace | None = None,
     ) -> None:
         self.world, self.plan_pose, self._rng = world, np.array(pose, float), rng
         self._sd, self._backlash = position_sd_mm, backlash_mm
-        self.pace = Pace() if pace is None else pace
+        self.pace = Pace()
         self.threshold = 0
         self.seconds = 0.0
         self.pattern: bytes | None = None

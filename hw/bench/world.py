@@ -49,10 +49,6 @@ class World(Tank):
 
     phantom: Phantom = field(default_factory=ActiveEcho)
 
-    def shift_mm(self, pose: Pose) -> float:
-        """Elevational place where the response is strongest, at this orientation, mm."""
-        return self.response_shift_mm(pose, self.phantom.response_scale)
-
     def loudness(self, pose: Pose) -> Float[np.ndarray, " elements"]:
         """Amplitude of every line at the phantom without noise or saturation, counts."""
         return self.phantom.loudness(self, pose)

@@ -3,9 +3,6 @@
 PLACEMENTS = ("amplitude-scan", "threshold-climb", "pattern-injection", "image-scan", "none")
 """How the target is brought into the mid-plane; the first is the default."""
 
-PHANTOMS = ("active-echo", "cross-wire", "hydrophone")
-"""What is in the tank; the first is the default."""
-
 PLACEMENTS_OF = {
     "active-echo": ("amplitude-scan", "threshold-climb", "pattern-injection", "none"),
     "cross-wire": ("image-scan", "none"),
@@ -13,6 +10,8 @@ PLACEMENTS_OF = {
 }
 """Placements possible with each phantom, the default first: a cross-wire is not connected to the
 electronics, and a hydrophone never answers."""
+PHANTOMS = tuple(PLACEMENTS_OF)
+"""What is in the tank; the first is the default."""
 
 CONTROLLERS = ("cb", "e")
 """Series of the emulated robot; the first is the default."""
