@@ -16,17 +16,19 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import itertools
 import re
 import socket
 import struct
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from hw.runtime.errors import LostError
 from jaxcal.runtime.messages import quoted
 
 DASHBOARD_PORT, PRIMARY_PORT = 29999, 30001
+_PATIENCE_S = 3.0
 STOP_PATIENCE_S = 0.3
 """Longest wait (wall s) for the dashboard to stop a program: somebody waits to be told of it."""
 
@@ -34,7 +36,8 @@ ROBOT_STATE, KINEMATICS_INFO = 16, 5
 """Types of the primary interface's message and of its part that holds the kinematics."""
 KINEMATICS = struct.Struct(">6I24dI")
 """Checksums of the joints; DH theta, a, d, alpha (rad, m), six each; state of the calibration."""
-_MOST_MESSAGE = 1 << 16
+_MOST_BYTES = 1 << 18
+"""After so many without a calibration there is none."""
 _REMOTE = "is in remote control"
 LOCAL = "the robot is in local control: switch it to remote control at the pendant"
 
@@ -77,7 +80,7 @@ class Identity:
         return ", ".join(part for part in (self.serial, calibration) if part)
 
 
-def read_identity(host: str, *, timeout_s: float = 3.0) -> Identity:
+def read_identity(host: str, *, timeout_s: float = _PATIENCE_S) -> Identity:
     """Ask the dashboard and the primary interface who the robot is.
 
     Raises:
@@ -114,13 +117,7 @@ def read_identity(host: str, *, timeout_s: float = 3.0) -> Identity:
     )
 
 
-def until_local(
-    host: str,
-    *,
-    period_s: float,
-    timeout_s: float = 3.0,
-    connect: Connect = socket.create_connection,
-) -> None:
+def until_local(host: str, *, period_s: float, connect: Connect) -> None:
     """Ask the dashboard again and again; returns once it says that the robot is in local control.
 
     A dashboard that is silent or gone says nothing about that, and is connected to again.
@@ -128,13 +125,13 @@ def until_local(
     while True:
         with (
             contextlib.suppress(OSError),
-            connect((host, DASHBOARD_PORT), timeout_s) as connection,
+            connect((host, DASHBOARD_PORT), _PATIENCE_S) as connection,
         ):
-            stream = _Lines(connection, time.monotonic() + timeout_s)
+            stream = _Lines(connection, time.monotonic() + _PATIENCE_S)
             stream.line()
             while stream.ask(_REMOTE).lower() != "false":
                 time.sleep(period_s)
-                stream.deadline = time.monotonic() + timeout_s
+                stream.deadline = time.monotonic() + _PATIENCE_S
             return
         time.sleep(period_s)
 
@@ -164,37 +161,28 @@ def _read_calibration(host: str, timeout_s: float) -> str | None:
         contextlib.suppress(OSError),
         socket.create_connection((host, PRIMARY_PORT), timeout=timeout_s) as connection,
     ):
-        while (left := deadline - time.monotonic()) > 0:
+        while (left := deadline - time.monotonic()) > 0 and len(data) < _MOST_BYTES:
             connection.settimeout(left)
             new = connection.recv(1 << 16)
             if not new:
-                return None
+                break
             data += new
-            while len(data) >= 5:
-                (size,) = struct.unpack_from(">I", data)
-                if not 5 <= size <= _MOST_MESSAGE:
-                    return None
-                if len(data) < size:
-                    break
-                message, data = data[:size], data[size:]
-                if message[4] == ROBOT_STATE:
-                    found = _calibration_in(message[5:])
-                    if found is not None:
-                        return found
+            states = [content for kind, content in _parts(data) if kind == ROBOT_STATE]
+            for kind, content in itertools.chain.from_iterable(map(_parts, states)):
+                if kind == KINEMATICS_INFO and len(content) >= KINEMATICS.size:
+                    # All but the last word, which is a state, not a property of the arm.
+                    return hashlib.sha256(content[: KINEMATICS.size - 4]).hexdigest()[:12]
     return None
 
 
-def _calibration_in(parts: bytes) -> str | None:
-    """The calibration among the parts of a robot-state message, if it is there."""
-    while len(parts) >= 5:
-        (size,) = struct.unpack_from(">I", parts)
-        if not 5 <= size <= len(parts):
-            return None
-        if parts[4] == KINEMATICS_INFO and size >= 5 + KINEMATICS.size:
-            # All but the last word, which is a state, not a property of the arm.
-            return hashlib.sha256(parts[5 : 5 + KINEMATICS.size - 4]).hexdigest()[:12]
-        parts = parts[size:]
-    return None
+def _parts(data: bytes) -> Iterator[tuple[int, bytes]]:
+    """Type and content of each message, or part of one, up to the first that is not whole."""
+    while len(data) >= 5:
+        size, kind = struct.unpack_from(">IB", data)
+        if not 5 <= size <= len(data):
+            return
+        yield kind, data[5:size]
+        data = data[size:]
 
 
 class _Lines:

@@ -147,7 +147,9 @@ class PendantSettings:
         if self.payload_kg is None:
             payload = "payload not reported"
         else:
-            payload = f"payload {self.payload_kg:g} kg at {_metres(self.payload_cog_m)}"
+            cog = self.payload_cog_m
+            at = "an unknown place" if cog is None else f"{listed(cog)} m"
+            payload = f"payload {self.payload_kg:g} kg at {at}"
         return f"{payload}, speed slider at {100 * self.speed_fraction:.0f} %"
 
 
@@ -164,8 +166,9 @@ def _apart(
     )
 
 
-def _metres(values: Sequence[float] | None) -> str:
-    return "an unknown place" if values is None else f"[{', '.join(f'{v:g}' for v in values)}] m"
+def listed(values: Sequence[float]) -> str:
+    """Numbers as a person reads them, e.g. ``[0, 0, 0.12]``."""
+    return f"[{', '.join(f'{v:g}' for v in values)}]"
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,21 +220,23 @@ class Packet:
         return self.runtime_state in _PAUSED
 
 
-def too_late(latency_s: float, limit_s: float) -> LostError | None:
-    """The error if the latency makes all poses look older than the limit; else None.
+def check_latency(latency_s: float, limit_s: float) -> None:
+    """Refuse a latency that makes all poses look older than the limit.
 
     Args:
         latency_s: :attr:`PacketReader.latency_s`, bench s.
         limit_s: largest age of a pose, bench s.
+
+    Raises:
+        LostError: it does.
     """
-    if latency_s <= limit_s:
-        return None
-    return LostError(
-        f"the poses may be on their way for {latency_s * 1000:.0f} ms, over the limit of "
-        f"{limit_s * 1000:.0f} ms: use a more direct connection (a cable, no tunnel), or reduce "
-        "the load of this computer",
-        device="robot",
-    )
+    if not latency_s <= limit_s:
+        raise LostError(
+            f"the poses may be on their way for {latency_s * 1000:.0f} ms, over the limit of "
+            f"{limit_s * 1000:.0f} ms: use a more direct connection (a cable, no tunnel), or "
+            "reduce the load of this computer",
+            device="robot",
+        )
 
 
 class PacketReader:

@@ -22,7 +22,7 @@ from typing import IO, Any
 import numpy as np
 
 from hw.robot.identity import Identity, read_identity
-from hw.robot.rtde import Packet, PendantSettings, too_late
+from hw.robot.rtde import Packet, PendantSettings, check_latency, listed
 from hw.runtime.clock import REAL, Clock, Lag, Waiting
 from hw.runtime.errors import DeviceError, LostError, StaleError, refused
 from hw.runtime.interrupts import lock_and_condition
@@ -290,9 +290,7 @@ class PoseStream:
             with self._process.stdout as told:
                 bound, latency_s = self._next(told)
                 self._lag = Lag(self.clock.at(bound[0]), bound[1])
-                problem = too_late(latency_s * self.clock.speed, self.max_age_s)
-                if problem is not None:
-                    raise problem
+                check_latency(latency_s * self.clock.speed, self.max_age_s)
                 while True:
                     self._take(self._next(told))
         except DeviceError as problem:
@@ -334,8 +332,8 @@ class PoseStream:
             self.tcp_offset = offset
         elif self._changed is None and offset_changed(self.tcp_offset, offset):
             self._changed = (
-                f"the controller's TCP offset changed from {_numbers(self.tcp_offset)} to "
-                f"{_numbers(offset)}: every pose now means something else; start a new recording"
+                f"the controller's TCP offset changed from {listed(self.tcp_offset)} to "
+                f"{listed(offset)}: every pose now means something else; start a new recording"
             )
 
 
@@ -352,7 +350,3 @@ def average(samples: Sequence[PoseSample]) -> SteadyPose:
     distances = np.sum((poses[:, :3, 3] - mean[:3, 3]) ** 2, axis=1)
     sample = replace(samples[-1], raw=raw, joints=None)
     return SteadyPose(sample, len(samples), float(np.sqrt(distances.mean())))
-
-
-def _numbers(values: Sequence[float]) -> str:
-    return "[" + ", ".join(f"{v:.6g}" for v in values) + "]"

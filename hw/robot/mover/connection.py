@@ -17,7 +17,7 @@ from hw.robot.mover.messages import DASHBOARD_STOP, MAY_BE_PAUSED, Setup
 from hw.robot.mover.no_reconnect import NoReconnect
 from hw.robot.mover.program import guarded_program, send_program
 from hw.robot.path_checks import check_plan
-from hw.robot.rtde import PORT, PROGRAM_RUNS, PacketReader, safety_text, state_text, too_late
+from hw.robot.rtde import PORT, PROGRAM_RUNS, PacketReader, check_latency, safety_text, state_text
 from hw.runtime.clock import Lag
 from hw.runtime.errors import LostError, refused
 from hw.runtime.extras import require
@@ -104,9 +104,7 @@ class Connection:
         asked_s, stamp_s = reader.bound
         lag = Lag(self._clock.at(asked_s), stamp_s)
         oldest = self._clock.patience(self._max_age_s)
-        problem = too_late(reader.latency_s * self._clock.speed, oldest)
-        if problem is not None:
-            raise problem
+        check_latency(reader.latency_s * self._clock.speed, oldest)
         self._inputs.attach(reader, lag)
         self._wait_for_packet()
 

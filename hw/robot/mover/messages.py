@@ -17,8 +17,6 @@ import json
 import os
 from dataclasses import asdict, dataclass, replace
 
-import numpy as np
-
 from hw.robot.confirmation import Confirmation
 from hw.robot.limits import Limits
 from hw.robot.motion_plan import MotionPlan
@@ -60,28 +58,11 @@ class Setup:
     def message(self) -> dict:
         """The setup as the first line of the process's input."""
         given = self.confirmation
-        return {
-            "host": self.host,
-            "clock": [self.clock.speed, self.clock.origin_s],
-            "dry_run": self.dry_run,
-            "caller_s": self.caller_s,
-            "plan": {
-                "targets": self.plan.targets.tolist(),
-                "limits": asdict(self.plan.limits),
-                "tcp_offset": self.plan.tcp_offset,
-                "serial": self.plan.serial,
-                "pendant": asdict(self.plan.pendant),
-            },
-            "confirmation": None
-            if given is None
-            else {
-                "digest": given.digest,
-                "serial": given.serial,
-                "issued_s": given.issued_s,
-                "expires_s": given.expires_s,
-                "asleep_s": given.asleep_s,
-            },
-        }
+        # The joints permit nothing, and may be others by now.
+        plan = asdict(self.plan) | {"targets": self.plan.targets.tolist(), "joints": None}
+        told = None if given is None else {k: v for k, v in vars(given).items() if k != "used"}
+        clock = asdict(self.clock)
+        return {**vars(self), "plan": plan, "confirmation": told, "clock": clock}
 
     @classmethod
     def of(cls, message: dict) -> Setup:
@@ -91,23 +72,15 @@ class Setup:
             RefusedError: it holds no plan.
         """
         plan, given = message["plan"], message["confirmation"]
-        cog = plan["pendant"]["payload_cog_m"]
-        return cls(
-            message["host"],
-            MotionPlan(
-                np.array(plan["targets"]),
-                Limits.from_mapping(plan["limits"]),
-                tuple(plan["tcp_offset"]),
-                plan["serial"],
-                pendant=PendantSettings(
-                    **{**plan["pendant"], "payload_cog_m": None if cog is None else tuple(cog)}
-                ),
-            ),
-            None if given is None else Confirmation(**given),
-            Clock(*message["clock"]),
-            message["dry_run"],
-            message["caller_s"],
-        )
+        limits, pendant = Limits.from_mapping(plan["limits"]), PendantSettings(**plan["pendant"])
+        if pendant.payload_cog_m is not None:
+            pendant = replace(pendant, payload_cog_m=tuple(pendant.payload_cog_m))
+        made = {
+            "plan": MotionPlan(**{**plan, "limits": limits, "pendant": pendant}),
+            "confirmation": None if given is None else Confirmation(**given),
+            "clock": Clock(**message["clock"]),
+        }
+        return cls(**{**message, **made})
 
 
 def plain(sample: PoseSample) -> dict:
