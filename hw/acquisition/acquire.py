@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -167,7 +167,8 @@ def acquire(
                 _finish(recorder, job.images - estimator.count)
 
     try:
-        with _closing(recorder):
+        # If it cannot be closed, its ``error`` says why.
+        with suppress(CalibrationError), recorder:
             try:
                 try:
                     run = _Run(
@@ -208,16 +209,6 @@ def acquire(
         interrupted=interrupted,
         by_itself=by_itself and recorder.error is None,
     )
-
-
-@contextmanager
-def _closing(recorder: Recorder) -> Iterator[None]:
-    """Close a recorder at the end; its failure, if any, is in its ``error``."""
-    try:
-        yield
-    finally:
-        with suppress(CalibrationError):
-            recorder.close()
 
 
 @dataclass
@@ -322,14 +313,12 @@ class _Run:
             try:
                 placement = self._place(row, stage)
                 shot = self._shoot(row, stage, session)
-            except SkippedError as error:
-                self.without.append(row)
-                view.given_up(row)
-                self._note("skipped", f"pose {row + 1}: {error.args[0]}")
-                continue
             except PlacementError as error:
                 self.without.append(row)
                 view.given_up(row)
+                if isinstance(error, SkippedError):
+                    self._note("skipped", f"pose {row + 1}: {error.args[0]}")
+                    continue
                 self._note("given up", f"pose {row + 1}: {error}")
                 session.check()
                 failures += 1

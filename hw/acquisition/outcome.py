@@ -26,36 +26,31 @@ def calibrate_and_print(path: str, *lines: str) -> dict[str, Any]:
     Raises:
         KeyboardInterrupt: interrupted; its text says that the recording is complete.
     """
-    hint: list[str] = []
+    again = ["jaxcal", "calibrate", path]
     try:
-        return _calibrated(path, lines, hint)
+        from jaxcal.calibration.calibrate import calibrate
+        from jaxcal.cli.common import print_page, segmented
+        from jaxcal.io.given_files import naming
+        from jaxcal.io.hdf5 import load
+        from jaxcal.report.paragraphs import Verbatim
+        from jaxcal.report.record import calibration_record
+        from jaxcal.report.tables import calibration_table
+        from jaxcal.report.verdict import verdict
+
+        recording, notes = segmented(load(path))
+        images = recording.calibration
+        scale = ("scale",) if images.kind == "pixel" and images.spacing_mm is None else ()
+        again += ["--estimate", "scale"] if scale else []
+        with naming(path):
+            result = calibrate(recording, estimate=scale)
+        record = calibration_record(result, recording)
+        record["warnings"] += notes
+        shown = Verbatim(f"  {command_line([*again, '--report', 'report.html'])}")
+        page = (*verdict(record), "", *lines, f"{path}: again, with a report:", shown)
+        print_page(calibration_table(record), *page)
     except KeyboardInterrupt:
-        again = command_line(["jaxcal", "calibrate", path, *hint])
-        text = f"interrupted; the recording is complete, calibrate it with: {again}"
-        raise KeyboardInterrupt(text) from None
-
-
-def _calibrated(path: str, lines: tuple[str, ...], hint: list[str]) -> dict[str, Any]:
-    from jaxcal.calibration.calibrate import calibrate
-    from jaxcal.cli.common import print_page, segmented
-    from jaxcal.io.given_files import naming
-    from jaxcal.io.hdf5 import load
-    from jaxcal.report.paragraphs import Verbatim
-    from jaxcal.report.record import calibration_record
-    from jaxcal.report.tables import calibration_table
-    from jaxcal.report.verdict import verdict
-
-    recording, notes = segmented(load(path))
-    images = recording.calibration
-    scale = ("scale",) if images.kind == "pixel" and images.spacing_mm is None else ()
-    hint += ["--estimate", "scale"] if scale else []
-    with naming(path):
-        result = calibrate(recording, estimate=scale)
-    record = calibration_record(result, recording)
-    record["warnings"] += notes
-    again = command_line(["jaxcal", "calibrate", path, *hint, "--report", "report.html"])
-    last = (f"{path}: again, with a report:", Verbatim(f"  {again}"))
-    print_page(calibration_table(record), *verdict(record), "", *lines, *last)
+        text = "interrupted; the recording is complete, calibrate it with: "
+        raise KeyboardInterrupt(text + command_line(again)) from None
     return record
 
 

@@ -104,14 +104,13 @@ class ActiveEcho:
         clock: of the bench; time-outs and time stamps are in its seconds.
         lines: lines per frame that the probe fires.
         queue: most frames that wait to be read.
-        baud: of a serial port.
 
     Raises:
         DeviceError: the port cannot be opened, or nothing behind it answers as this device would.
     """
 
     def __init__(
-        self, url: str, *, clock: Clock = REAL, lines: int = 128, queue: int = 512, baud: int = BAUD
+        self, url: str, *, clock: Clock = REAL, lines: int = 128, queue: int = 512
     ) -> None:
         if not 1 <= lines <= MAXIMUM_LINES:
             raise DeviceError(f"lines must be 1 to {MAXIMUM_LINES}, not {lines}", device=DEVICE)
@@ -133,7 +132,7 @@ class ActiveEcho:
         self._tick_s = 0.0
         self._failure: LostError | None = None
         self._stopping = False
-        self._transport = open_transport(url, baud=baud)
+        self._transport = open_transport(url)
         self._reader = threading.Thread(target=self._read_on, name="active echo", daemon=True)
         self._reader.start()
         try:

@@ -93,7 +93,7 @@ class Transport:
             inner.close()
 
 
-def open_transport(url: str, *, baud: int = BAUD) -> Transport:
+def open_transport(url: str) -> Transport:
     """Open a serial port or a pty by its path, or ``socket://host:port`` (a serial-to-TCP bridge).
 
     A port is opened exclusively: a second program that opens it in the same way is refused.
@@ -104,7 +104,7 @@ def open_transport(url: str, *, baud: int = BAUD) -> Transport:
     serial: Any = require("serial", extra="serial")
     options: dict[str, Any] = {"timeout": _POLL_S, "write_timeout": _WRITE_TIMEOUT_S}
     if "://" not in url:
-        options |= {"baudrate": baud, "exclusive": True}
+        options |= {"baudrate": BAUD, "exclusive": True}
     if url.startswith("socket://") and not _has_port(url):
         raise DeviceError(f"cannot open {url}: write it as socket://host:port", device=DEVICE)
     try:
