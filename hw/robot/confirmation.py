@@ -29,7 +29,7 @@ class Confirmation:
         expires_s: bench time by which the connection must be made; later motions are not limited.
         asleep_s: reading of :func:`hw.runtime.clock.asleep_s` when it was issued.
         unattended: whether it was given without asking a person.
-        used: set when motion is started with it; every start needs a new confirmation.
+        use: the only one, taken when motion is started; every start needs a new confirmation.
     """
 
     digest: str
@@ -38,7 +38,7 @@ class Confirmation:
     expires_s: float
     asleep_s: float
     unattended: bool = False
-    used: threading.Event = field(default_factory=threading.Event, compare=False, repr=False)
+    use: threading.Semaphore = field(default_factory=threading.Semaphore, compare=False, repr=False)
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Challenge:
     Attributes:
         plan: the plan to confirm; it is checked first.
         nonce: random.
-        used: set once it was answered correctly.
+        use: the only one, taken by the right answer.
 
     Raises:
         RefusedError: the plan is not allowed.
@@ -56,7 +56,7 @@ class Challenge:
 
     plan: MotionPlan
     nonce: bytes = field(default_factory=lambda: secrets.token_bytes(16))
-    used: threading.Event = field(default_factory=threading.Event, compare=False, repr=False)
+    use: threading.Semaphore = field(default_factory=threading.Semaphore, compare=False, repr=False)
 
     def __post_init__(self) -> None:
         check_plan(self.plan)
@@ -81,11 +81,10 @@ def confirm(
     Raises:
         RefusedError: another answer, or a challenge that was answered before.
     """
-    if challenge.used.is_set():
-        raise refused("this code was typed before; each run has a code of its own")
     if answer.strip().lower() != challenge.code:
         raise refused("not confirmed: the code typed is not the one shown")
-    challenge.used.set()
+    if not challenge.use.acquire(blocking=False):
+        raise refused("this code was typed before; each run has a code of its own")
     return _confirmation(challenge.plan, clock, valid_s, unattended=False)
 
 

@@ -146,11 +146,10 @@ class Motion:
         if not self.dry_run:
             if given is None:
                 raise refused("motion needs the operator's confirmation")
-            if given.used.is_set():
+            if not given.use.acquire(blocking=False):
                 raise refused(
                     "this confirmation was used for an earlier connection; confirm the plan again"
                 )
-            given.used.set()
         if self._stop is not None:
             self._ended = self._stop
             raise refused(f"motion was stopped ({self._stop.args[0]})")

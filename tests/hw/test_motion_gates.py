@@ -290,7 +290,7 @@ def test_a_plan_goes_on_after_its_confirmation_has_expired():
             motion.move_to(PLAN.targets[1])
             robot.clock.sleep(given.expires_s - robot.clock.now() + 0.1)
             assert motion.move_to(HOME).pose[0, 3] == pytest.approx(400.0)
-        late = replace(given, used=threading.Event())
+        late = replace(given, use=threading.Semaphore())
         with pytest.raises(RefusedError, match="expired"):
             Motion(robot.host, plan, late, **named).start()
 

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
+import threading
 import tomllib
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -42,7 +45,7 @@ LIMITS = Limits(
 CLOCK = Clock()
 
 
-def pose(x: float, y: float, z: float, tilt: tuple[float, float, float] = (0.0, 0.0, 0.0)):
+def pose(x: float, y: float, z: float, tilt: tuple[float, ...] = (0.0, 0.0, 0.0)) -> np.ndarray:
     """A TCP that looks down, tilted by a rotation vector (deg), at mm."""
     rotation = Rotation.from_rotvec(np.radians(tilt)) * Rotation.from_rotvec([math.pi, 0, 0])
     full = np.eye(4)
@@ -315,6 +318,25 @@ def test_a_code_is_of_one_run_only():
     assert not confirm(second, second.code, clock=CLOCK).unattended
     with pytest.raises(RefusedError, match="was typed before"):
         confirm(second, second.code, clock=CLOCK)
+
+
+def test_one_of_two_threads_that_answer_at_once_is_confirmed():
+    """Both were: each looked whether the code had been typed before the other noted it."""
+    both = threading.Barrier(2)
+
+    class Typed(str):
+        def strip(self, *_: object) -> str:
+            both.wait(10.0)
+            return str(self)
+
+    def answer(typed: str) -> Confirmation | None:
+        with suppress(RefusedError):
+            return confirm(challenge, typed, clock=CLOCK)
+
+    challenge = Challenge(PLAN)
+    with ThreadPoolExecutor(2) as pool:
+        given = list(pool.map(answer, [Typed(challenge.code)] * 2))
+    assert given.count(None) == 1
 
 
 def test_unattended_motion_names_its_plan():

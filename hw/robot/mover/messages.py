@@ -60,7 +60,7 @@ class Setup:
         given = self.confirmation
         # The joints permit nothing, and may be others by now.
         plan = asdict(self.plan) | {"targets": self.plan.targets.tolist(), "joints": None}
-        told = None if given is None else {k: v for k, v in vars(given).items() if k != "used"}
+        told = None if given is None else {k: v for k, v in vars(given).items() if k != "use"}
         clock = asdict(self.clock)
         return {**vars(self), "plan": plan, "confirmation": told, "clock": clock}
 
