@@ -84,6 +84,7 @@ import gc
 import hypothesis
 import jax
 import jax.numpy as jnp
+import jaxtyping
 import numpy as np
 import pytest
 from _pytest.runner import runtestprotocol
@@ -161,6 +162,12 @@ def _scheduling_is_kept():
     yield
     if sys.platform == "linux":
         assert os.sched_getscheduler(0) == before
+
+
+@pytest.fixture
+def unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without run-time type checks, which take most of the time of many short calls."""
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
 
 
 @pytest.fixture(scope="session")

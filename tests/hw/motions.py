@@ -46,18 +46,20 @@ PLAN = MotionPlan(np.array([HOME, beside(10.0, 5.0, 0.0), beside(50.0, 0.0, 0.0)
                   OFFSET, SERIAL)  # fmt: skip
 
 
+def confirmed(robot: EmulatedRobot, plan: MotionPlan = PLAN, **named) -> Motion:
+    """A motion that is not started yet."""
+    if plan.serial == SERIAL:
+        plan = replace(plan, serial=read_identity(robot.host).name)
+    given = confirm_unattended(plan, plan.digest, clock=robot.clock)
+    return Motion(robot.host, plan, given, clock=robot.clock, dry_run=False, **named)
+
+
 @contextmanager
 def moving(
     robot: EmulatedRobot, log: list | None = None, plan: MotionPlan = PLAN, **named
 ) -> Iterator[Motion]:
-    if plan.serial == SERIAL:
-        plan = replace(plan, serial=read_identity(robot.host).name)
-    confirmation = confirm_unattended(plan, plan.digest, clock=robot.clock)
-    motion = Motion(
-        robot.host, plan, confirmation, clock=robot.clock, dry_run=False,
-        log=None if log is None else lambda *entry: log.append(entry), **named,
-    )  # fmt: skip
-    with motion:
+    keep = None if log is None else lambda *entry: log.append(entry)
+    with confirmed(robot, plan, log=keep, **named) as motion:
         yield motion
 
 

@@ -14,8 +14,9 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Self
+from typing import IO, Any, Self
 from unittest.mock import Mock
 
 import h5py
@@ -27,6 +28,7 @@ pytest.importorskip("serial", reason="pyserial is not installed (jaxcal[serial])
 
 from motions import LIMITS, OFFSET, SERIAL, beside
 from test_recorder import wait_until_closed
+from waiting import until
 
 import jaxcal
 from hw.acquisition.acquire import AcquisitionStopped, Outcome, _write_truth, acquire
@@ -227,11 +229,9 @@ def fault_in_the_middle(tmp_path, name: str, speed: float, rest_s: float | None)
         assert what in line
         assert "\n" not in line
         assert f"acquire {path} --resume" in line
-        deadline = time.monotonic() + 30
-        while (rest := bench.rest_since()) is None:
-            assert time.monotonic() < deadline
+        until(lambda: bench.rest_since() is not None, 30.0)
         if rest_s is not None:
-            assert rest - striker.at[0] <= rest_s
+            assert bench.rest_since() - striker.at[0] <= rest_s
         before = taken(path)
         assert len(before) >= 2
         with h5py.File(path) as file:
@@ -253,6 +253,20 @@ def test_every_fault_stops_the_robot_and_the_run_is_resumed(tmp_path, name):
     fault_in_the_middle(tmp_path, name, 1.0, None if name.startswith("image") else 0.2)
 
 
+def begun(path: Path, *options: str, **named: Any) -> tuple[subprocess.Popen[str], IO[str]]:
+    """An acquisition on an emulated bench as a job, and what it writes for its user."""
+    start = [sys.executable, "-m", "hw", "acquire", str(path), "--bench", "--placement", "none",
+             "--bench-seed", "3", *options]  # fmt: skip
+    process = subprocess.Popen(start, stderr=subprocess.PIPE, text=True, **named)
+    assert process.stderr is not None
+    return process, process.stderr
+
+
+def resumed(path: Path, *options: str) -> subprocess.CompletedProcess[str]:
+    start = [sys.executable, "-m", "hw", "acquire", str(path), "--bench", "--resume", *options]
+    return subprocess.run(start, capture_output=True, text=True, timeout=900)
+
+
 @pytest.mark.parametrize(
     ("number", "times", "moment", "least"),
     [(signal.SIGINT, 12, "image 0 (", 1), (signal.SIGTERM, 1, "confirmed: ", 0)],
@@ -264,28 +278,22 @@ def test_signals_end_a_background_job_in_order(tmp_path, number, times, moment, 
     A shell's background job is started with Ctrl-C ignored.
     """
     path = tmp_path / "rec.h5"
-    code = "import sys; from hw.cli.main import main; sys.exit(main(sys.argv[1:]))"
-    arguments = ["acquire", str(path), "--bench", "--images", "4", "--placement", "none",
-                 "--bench-seed", "3"]  # fmt: skip
-    process = subprocess.Popen(
-        [sys.executable, "-c", code, *arguments], stderr=subprocess.PIPE, text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN),
-    )  # fmt: skip
-    assert process.stderr is not None
-    with process.stderr:
-        for line in process.stderr:
+    deaf = partial(signal.signal, signal.SIGINT, signal.SIG_IGN)
+    process, told = begun(path, "--images", "4", preexec_fn=deaf)
+    with told:
+        for line in told:
             if line.startswith(moment):
                 break
         for k in range(times):
             if k:
                 time.sleep(0.02)
             process.send_signal(number)
-        rest = process.stderr.read()
+        rest = told.read()
     assert process.wait() == 130, rest
     # More may have been taken before the signal came.
-    told = rf"jaxcal-hw: error: interrupted; [{least}-4] of 4 images are in {path}; to go on: "
-    told += rf"jaxcal-hw acquire {path} --resume --bench"
-    assert re.fullmatch(told, rest.splitlines()[-1]), rest
+    last = rf"jaxcal-hw: error: interrupted; [{least}-4] of 4 images are in {path}; to go on: "
+    last += rf"jaxcal-hw acquire {path} --resume --bench"
+    assert re.fullmatch(last, rest.splitlines()[-1]), rest
     assert "Traceback" not in rest
     wait_until_closed(path)
     with h5py.File(path) as file:
@@ -325,10 +333,9 @@ def test_a_person_takes_an_image_skips_a_pose_and_stops(tmp_path):
     from terminal import Terminal
 
     path = tmp_path / "rec.h5"
-    code = "import sys; from hw.cli.main import main; sys.exit(main(sys.argv[1:]))"
     arguments = ["acquire", str(path), "--bench", "--bench-seed", "3", "--images", "4",
                  "--placement", "pattern-injection", "--operator", "person"]  # fmt: skip
-    with Terminal(["-c", code, *arguments], tmp_path) as person:
+    with Terminal(["-m", "hw", *arguments], tmp_path) as person:
         person.wait_for("p pauses, Ctrl-C stops")
         # Steps twice as large: as few as a bar that must be seen to shrink allows.
         person.wait_for("step 0.25 mm")
@@ -539,9 +546,7 @@ def test_a_fault_of_any_device_stops_the_robot_and_the_run_is_resumed(e_series, 
         assert re.search(what, str(stopped))
         assert "\n" not in str(stopped)
         assert "--resume --bench" in str(stopped)
-        deadline = time.monotonic() + 30
-        while bench.rest_since() is None:
-            assert time.monotonic() < deadline
+        until(lambda: bench.rest_since() is not None, 30.0)
         bench.recover()
         if name != "removed":
             with h5py.File(path) as file:
@@ -551,9 +556,14 @@ def test_a_fault_of_any_device_stops_the_robot_and_the_run_is_resumed(e_series, 
 
 
 def first_end(
-    bench: Bench, path: Path, say: Callable[[str], None], kind: type[Exception]
+    bench: Bench, path: Path, confirmed: Callable[[], None], kind: type[Exception]
 ) -> Exception:
-    """How a run ended that a busy machine has not ended before."""
+    """How a run ended that a busy machine has not ended before it was confirmed."""
+
+    def say(line: str) -> None:
+        if line.startswith("confirmed: "):
+            confirmed()
+
     request: AcquisitionRequest | None = AcquisitionRequest(4, "none", 1, bench=3)
     for _ in range(ATTEMPTS):
         with pytest.raises((AcquisitionStopped, kind)) as ended:
@@ -567,13 +577,8 @@ def first_end(
 def test_what_ends_a_run_is_recorded_whatever_it_is(e_series, tmp_path):
     """As where the pipe that standard error leads to is closed: nobody else can tell later."""
     path = tmp_path / "rec.h5"
-
-    def say(line: str) -> None:
-        if line.startswith("confirmed: "):
-            raise BrokenPipeError(errno.EPIPE, "Broken pipe")
-
-    ended = first_end(e_series, path, say, BrokenPipeError)
-    assert isinstance(ended, BrokenPipeError)
+    broken = Mock(side_effect=BrokenPipeError(errno.EPIPE, "Broken pipe"))
+    assert isinstance(first_end(e_series, path, broken, BrokenPipeError), BrokenPipeError)
     with h5py.File(path) as file:
         assert file["events/kind"][-1] == b"stopped"
         assert file["events/text"][-1] == b"BrokenPipeError: [Errno 32] Broken pipe"
@@ -590,17 +595,14 @@ def named(process: Path, argument: Path) -> bool:
 def test_a_disk_that_fails_as_well_does_not_hide_why_the_robot_was_stopped(e_series, tmp_path):
     path = tmp_path / "rec.h5"
 
-    def say(line: str) -> None:
-        if line.startswith("confirmed: "):
-            (writer,) = (
-                int(process.name)
-                for process in Path("/proc").glob("[0-9]*")
-                if named(process, path)
-            )
-            resource.prlimit(writer, resource.RLIMIT_FSIZE, (1000, 1000))
-            raise StoppedError("protective stop", device="robot")
+    def fail() -> None:
+        (writer,) = (
+            int(process.name) for process in Path("/proc").glob("[0-9]*") if named(process, path)
+        )
+        resource.prlimit(writer, resource.RLIMIT_FSIZE, (1000, 1000))
+        raise StoppedError("protective stop", device="robot")
 
-    ended = first_end(e_series, path, say, AcquisitionStopped)
+    ended = first_end(e_series, path, fail, AcquisitionStopped)
     assert re.match(r"robot: protective stop; .*: cannot be written: .*; 0 of 4 images", str(ended))
 
 
@@ -613,11 +615,8 @@ def test_an_interrupt_while_the_end_is_noted_does_not_hide_it(e_series, tmp_path
             signal.raise_signal(signal.SIGINT)
             return super().__str__()
 
-    def say(line: str) -> None:
-        if line.startswith("confirmed: "):
-            raise Lost("gone", device="robot")
-
-    ended = first_end(e_series, path, say, AcquisitionStopped)
+    lost = Mock(side_effect=Lost("gone", device="robot"))
+    ended = first_end(e_series, path, lost, AcquisitionStopped)
     assert "interrupted; 0 of 4" in str(ended)
     with h5py.File(path) as file:
         assert file["events/kind"][-1] == b"stopped"
@@ -627,26 +626,17 @@ def test_an_interrupt_while_the_end_is_noted_does_not_hide_it(e_series, tmp_path
 @pytest.mark.slow
 def test_killed_and_resumed(tmp_path, capfd):
     path = tmp_path / "rec.h5"
-    code = "import sys; from hw.cli.main import main; sys.exit(main(sys.argv[1:]))"
-    arguments = ["acquire", str(path), "--bench", "--images", str(IMAGES), "--placement", "none",
-                 "--speed", "3", "--bench-seed", "3", "--controller", "e"]  # fmt: skip
-    process = subprocess.Popen(
-        [sys.executable, "-c", code, *arguments], stderr=subprocess.PIPE, text=True
-    )
-    assert process.stderr is not None
-    for line in process.stderr:
-        if line.startswith("image 1 ("):
-            break
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
-    process.stderr.close()
+    process, told = begun(path, "--images", str(IMAGES), "--speed", "3", "--controller", "e")
+    with told:
+        for line in told:
+            if line.startswith("image 1 ("):
+                break
+        process.kill()
+        process.wait()
     wait_until_closed(path)
     before = taken(path)
     assert len(before) >= 2
-    done = subprocess.run(
-        [sys.executable, "-c", code, "acquire", str(path), "--bench", "--resume", "--speed", "3"],
-        capture_output=True, text=True, timeout=500,
-    )  # fmt: skip
+    done = resumed(path, "--speed", "3")
     assert done.returncode in (0, 3, 5), done.stderr
     assert "reconstruction precision" in done.stdout
     assert len(jaxcal.load(path)) == IMAGES
@@ -807,16 +797,10 @@ def viewers(parent: int) -> list[int]:
 def test_a_killed_view_changes_nothing_in_an_acquisition(tmp_path):
     pytest.importorskip("viser", reason="viser is not installed (jaxcal[view])")
     path = tmp_path / "rec.h5"
-    code = "import sys; from hw.cli.main import main; sys.exit(main(sys.argv[1:]))"
-    arguments = ["acquire", str(path), "--bench", "--images", str(IMAGES), "--placement", "none",
-                 "--speed", "3", "--bench-seed", "3", "--view"]  # fmt: skip
-    process = subprocess.Popen(
-        [sys.executable, "-c", code, *arguments], stderr=subprocess.PIPE, text=True
-    )
-    assert process.stderr is not None
+    process, written = begun(path, "--images", str(IMAGES), "--speed", "3", "--view")
     lines = []
-    with process.stderr:
-        for line in process.stderr:
+    with written:
+        for line in written:
             lines.append(line)
             if line.startswith("image 1 ("):
                 (viewer,) = viewers(process.pid)
@@ -828,9 +812,7 @@ def test_a_killed_view_changes_nothing_in_an_acquisition(tmp_path):
     if code == 4:
         # Not by the view: a busy machine held a device up, and the last line says which.
         assert "view" not in lines[-1]
-        again = [sys.executable, "-c", "import sys; from hw.cli.main import main; sys.exit(main())"]
-        again += ["acquire", str(path), "--bench", "--resume", "--speed", "3"]
-        code = subprocess.run(again, capture_output=True, timeout=500, check=False).returncode
+        code = resumed(path, "--speed", "3").returncode
     assert code in (0, 3, 5), lines
     assert len(jaxcal.load(path)) == IMAGES
 
@@ -839,22 +821,16 @@ def test_a_killed_view_changes_nothing_in_an_acquisition(tmp_path):
 @pytest.mark.parametrize("what", ["limit", "removed"])
 def test_a_failing_disk_is_one_line_and_status_4(tmp_path, what):
     path = tmp_path / "rec.h5"
-    code = "import sys; from hw.cli.main import main; sys.exit(main())"
     limit = 3 * 2**20 if what == "limit" else resource.RLIM_INFINITY
-    arguments = ["acquire", str(path), "--bench", "--images", "12", "--placement", "none",
-                 "--speed", "2", "--bench-seed", "3"]  # fmt: skip
-    process = subprocess.Popen(
-        [sys.executable, "-P", "-c", code, *arguments], stderr=subprocess.PIPE, text=True,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit,) * 2),
-    )  # fmt: skip
-    assert process.stderr is not None
+    limited = partial(resource.setrlimit, resource.RLIMIT_FSIZE, (limit,) * 2)
+    process, told = begun(path, "--images", "12", "--speed", "2", preexec_fn=limited)
     lines = []
-    for line in process.stderr:
-        lines.append(line)
-        if line.startswith("image 0 (") and what == "removed":
-            path.unlink()
+    with told:
+        for line in told:
+            lines.append(line)
+            if line.startswith("image 0 (") and what == "removed":
+                path.unlink()
     assert process.wait() == 4, lines
-    process.stderr.close()
     assert not any("Traceback" in line or "Exception" in line for line in lines)
     reason = (
         "the disk cannot be written any more: File too large" if what == "limit" else "was removed"
@@ -868,7 +844,6 @@ def test_a_failing_disk_is_one_line_and_status_4(tmp_path, what):
     with h5py.File(path) as file:
         assert not file.attrs["complete"]
         assert len(file["calibration/target"]) >= int(found[1])
-    finish_with = [sys.executable, "-P", "-c", code, "acquire", str(path), "--bench", "--resume"]
-    done = subprocess.run(finish_with, capture_output=True, text=True, timeout=900, check=False)
+    done = resumed(path)
     assert done.returncode in (0, 3, 5), done.stderr
     assert len(jaxcal.load(path)) == 12

@@ -7,13 +7,13 @@ import os
 import shutil
 import subprocess
 import threading
-import time
 import tty
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+from waiting import exhaust, until
 
 from hw.active_echo import ActiveEcho, EchoFrame, EchoStatistics
 from hw.active_echo.codec import EchoPacket, decode_line, encode_echo, encode_line, encode_reply
@@ -55,21 +55,8 @@ def opened(device: AuspisEmulator, **options) -> ActiveEcho:
     return ActiveEcho(device.path, clock=device._clock, **options)
 
 
-def until(condition: Callable[[], object], seconds: float = 180.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.002)
-
-
 def frames_of(device: ActiveEcho, count: int) -> list[EchoFrame]:
     return [device.read(PATIENCE_S) for _ in range(count)]
-
-
-def exhaust(device: ActiveEcho, timeout_s: float) -> None:
-    """Read until there is nothing more to read, which is always an error."""
-    while True:
-        device.read(timeout_s)
 
 
 def test_commands(emulator: AuspisEmulator) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import zlib
 
-import jaxtyping
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -202,12 +201,6 @@ def damage(data: bytes, kind: int, rng: np.random.Generator) -> bytes:
     else:
         return damage(damage(data, 0, rng), int(rng.integers(1, 6)), rng) or b"\x07"
     return bytes(spoilt)
-
-
-@pytest.fixture
-def unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without run-time type checks, which take most of the time of so many calls."""
-    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
 
 
 def test_fuzz(unchecked: None) -> None:

@@ -7,11 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from test_feasibility import swung
 
 from hw.bench.arm import Arm
 from hw.bench.controller import NORMAL, Controller
 from hw.bench.robot import START as START_DOWN
-from hw.robot.kinematics import MODELS, forward, link_frames, tool_of
+from hw.robot.kinematics import MODELS, forward, tool_of
 from hw.runtime.rigid import pose_to_ur, ur_to_pose
 
 START = (0.4, 0.0, 0.3, 0.0, 3.0, 0.0)
@@ -145,14 +146,7 @@ def test_joints_bring_the_tool_where_the_arm_says_that_it_is(model):
 def test_the_arm_stops_protectively_before_a_wrist_singularity_and_its_reach():
     """A tool that points sideways is turned about the vertical, so that axis 6 meets axis 4."""
     ur5 = MODELS["UR5"]
-    near = np.array([0.3, -1.3, 1.6, -0.3, 0.475, 0.2])
-    frames = link_frames(ur5, near)
-    (x, y), (u, v) = frames[6, :2, 2], frames[1, :2, 2]
-    swing = Rotation.from_rotvec([0.0, 0.0, 2 * np.arctan2(x * v - y * u, x * u + y * v)])
-    start = pose_to_ur(frames[6])
-    turned = frames[6].copy()
-    turned[:3, :3] = swing.as_matrix() @ turned[:3, :3]
-    goal = pose_to_ur(turned)
+    start, goal = map(pose_to_ur, swung()[1:])
     out = start.copy()
     out[:2] += 0.6 * start[:2] / np.linalg.norm(start[:2])
     for target, text in ((goal, "singularity"), (out, "reach")):

@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+from waiting import until
 
 pytest.importorskip("serial", reason="pyserial is not installed")
 pytest.importorskip("cobs", reason="cobs is not installed")
@@ -87,14 +87,11 @@ def test_images_show_the_injected_bar_below_the_echo(bench):
         before = brightness(3)
         echo.load_pattern(bar(31, 64, 128))
         echo.inject(True, BAR_DELAY_S)
-        deadline = time.monotonic() + 180
-        while brightness(1) < 250 and time.monotonic() < deadline:
-            pass
+        until(lambda: brightness(1) > 250)
         assert brightness(1) == 255
         assert before < 200
         echo.inject(False)
-        while brightness(1) > 250 and time.monotonic() < deadline:
-            pass
+        until(lambda: brightness(1) < 250)
         assert brightness(1) < 200
 
 
@@ -104,10 +101,7 @@ def test_faults_come_and_go(bench):
         echo.read(600.0)
         at = bench.fault("crc_errors", rate=1.0)
         assert at <= bench.clock.now()
-        deadline = time.monotonic() + 180
-        while echo.statistics().crc_errors < 5 and time.monotonic() < deadline:
-            time.sleep(0.02)
-        assert echo.statistics().crc_errors >= 5
+        until(lambda: echo.statistics().crc_errors >= 5)
         bench.recover()
         echo.drain()
         assert echo.read(600.0).frame > 0
@@ -141,12 +135,4 @@ def test_a_bench_ends_with_whoever_started_it():
         [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, timeout=300,
         env={**os.environ, "PYTHONPATH": str(ROOT)}, check=False,
     )  # fmt: skip
-    pid = int(started.stdout)
-    deadline = time.monotonic() + 180
-    while time.monotonic() < deadline:
-        try:
-            os.kill(pid, 0)
-        except ProcessLookupError:
-            return
-        time.sleep(0.05)
-    pytest.fail("the bench outlived its starter")
+    until(lambda: not Path(f"/proc/{int(started.stdout)}").exists())

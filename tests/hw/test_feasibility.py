@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from test_safety import pose as down
 
 from hw.bench.joints import first_joints
 from hw.robot.feasibility import Arm, check_model, follow, follow_all
@@ -45,14 +46,6 @@ ARM = Arm(
     np.array([2000.0, 2000.0, 2000.0]),
 )
 WAYS = 100
-
-
-def down(x: float, y: float, z: float, tilt: tuple[float, ...] = (0.0, 0.0, 0.0)) -> np.ndarray:
-    """A TCP that looks down, tilted by a rotation vector (deg), at mm."""
-    pose = np.eye(4)
-    turn = Rotation.from_rotvec(np.radians(tilt)) * Rotation.from_rotvec([math.pi, 0, 0])
-    pose[:3, :3], pose[:3, 3] = turn.as_matrix(), (x, y, z)
-    return pose
 
 
 def joints_at(pose: np.ndarray, model=UR5) -> np.ndarray:

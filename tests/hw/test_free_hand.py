@@ -10,10 +10,9 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -31,6 +30,8 @@ from plus_server import (
     messages,
 )
 from scipy.spatial.transform import Rotation
+from test_ultrasound import peer
+from waiting import until
 
 import jaxcal
 from hw.acquisition.outcome import calibrate_and_print
@@ -419,8 +420,7 @@ def test_ctrl_c_at_a_terminal(tmp_path, tracked):
     pytest.importorskip("pty", reason="there are no pseudo-terminals here")
     from terminal import Terminal
 
-    command = "import sys; from hw.cli.main import main; sys.exit(main(sys.argv[1:]))"
-    arguments = ["-c", command, "free-hand", f"127.0.0.1:{tracked}", "r.h5"]
+    arguments = ["-m", "hw", "free-hand", f"127.0.0.1:{tracked}", "r.h5"]
     with Terminal(arguments, tmp_path) as person:
         person.wait_for(r"image 0 \(1 of 30\): target at")
         person.wait_for("next: bring the target to the")
@@ -530,10 +530,7 @@ def test_images_that_were_dropped_before_the_start_do_not_matter(separate):
     All images were then said to be of a clock that was set.
     """
     with UltrasoundStream("127.0.0.1", separate, queue=8) as stream:
-        deadline = time.monotonic() + 60.0
-        while stream.statistics().dropped < 20:
-            assert time.monotonic() < deadline
-            time.sleep(0.01)
+        until(lambda: stream.statistics().dropped >= 20)
         images = PosedImages(stream)
         assert not images.by_arrival
         assert [each.why for _ in range(9) if (each := images.read(60.0)).pose is None] == []
@@ -546,21 +543,16 @@ def test_frames_that_are_held_up_at_the_start_are_known_all_the_same():
     # The image and ProbeToTracker.
     size = cut.index(b"ReferenceToTracker") - 14
 
-    def serve() -> None:
-        with listener.accept()[0] as connection, suppress(OSError):
-            connection.sendall(cut[:size])
-            time.sleep(0.8)
-            connection.sendall(cut[size:])
-            for more in first:
-                connection.sendall(more)
-                time.sleep(0.01)
+    def talk(connection: socket.socket) -> None:
+        connection.sendall(cut[:size])
+        time.sleep(0.8)
+        connection.sendall(cut[size:])
+        for more in first:
+            connection.sendall(more)
+            time.sleep(0.01)
 
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        thread = threading.Thread(target=serve)
-        thread.start()
-        with UltrasoundStream(*listener.getsockname()) as stream:
-            assert PosedImages(stream).pair == ("Probe", "Reference")
-        thread.join()
+    with peer(talk) as stream:
+        assert PosedImages(stream).pair == ("Probe", "Reference")
 
 
 @contextmanager
@@ -572,27 +564,20 @@ def sending(stamp: Callable[[str, float], float]) -> Iterator[PosedImages]:
     """
     picture = Picture(np.zeros((4, 4), np.uint8), SPACING_MM)
 
-    def serve() -> None:
-        with listener.accept()[0] as connection, suppress(OSError):
-            began = time.monotonic()
-            for t in np.arange(0.0, 1.6, 0.02):
-                time.sleep(max(0.0, began + t - time.monotonic()))
-                pose = np.eye(4)
-                pose[0, 3] = t
-                moved = Message(
-                    "TRANSFORM", "ProbeToTracker", stamp("TRANSFORM", t),
-                    (Tracked("ProbeToTracker", pose),),
-                )  # fmt: skip
-                shown = Message("IMAGE", "Image", stamp("IMAGE", t + 0.01), picture)
-                connection.sendall(encode(moved) + encode(shown))
-            connection.recv(1)
+    def talk(connection: socket.socket) -> None:
+        began = time.monotonic()
+        for t in np.arange(0.0, 1.6, 0.02):
+            time.sleep(max(0.0, began + t - time.monotonic()))
+            pose = np.eye(4)
+            pose[0, 3] = t
+            tracked = (Tracked("ProbeToTracker", pose),)
+            moved = Message("TRANSFORM", "ProbeToTracker", stamp("TRANSFORM", t), tracked)
+            shown = Message("IMAGE", "Image", stamp("IMAGE", t + 0.01), picture)
+            connection.sendall(encode(moved) + encode(shown))
+        connection.recv(1)
 
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        thread = threading.Thread(target=serve)
-        thread.start()
-        with UltrasoundStream(*listener.getsockname()) as stream:
-            yield PosedImages(stream)
-        thread.join()
+    with peer(talk) as stream:
+        yield PosedImages(stream)
 
 
 def test_no_image_has_the_pose_of_an_earlier_place_after_its_clock_was_set_back():

@@ -196,6 +196,20 @@ class Person:
         return key
 
 
+class Sweeping(Person):
+    """Slides the probe to and fro, until something is told or the picture was seen often enough."""
+
+    def __init__(self, hand: Hand, told: str, most: int) -> None:
+        super().__init__(hand)
+        self._told, self._left = told, most
+
+    def show(self, frame: np.ndarray, words: str, advice: str) -> None:
+        super().show(frame, words, "nothing heard: to and fro")
+        self._left -= 1
+        if self._left <= 0 or re.search(self._told, words):
+            self._keys.append("q")
+
+
 def test_a_person_follows_the_bar_by_hand(tmp_path, bench):
     path, person = tmp_path / "r.h5", Person(bench.hand)
     stopping = Person(bench.hand, image_1="u", taken_back="ctrl-c")
@@ -280,15 +294,12 @@ def test_enter_is_refused_until_both_sides_were_seen(tmp_path, bench):
 
 
 def test_poses_in_metres_are_told_of(tmp_path, bench):
-    class Sweeping(Person):
-        def show(self, frame: np.ndarray, words: str, advice: str) -> None:
-            super().show(frame, words, "nothing heard: to and fro")
-            if "look like metres: let the server send them in mm" in words:
-                self._keys.append("q")
-
+    told = "look like metres: let the server send them in mm"
+    person = Sweeping(bench.hand, told, 10_000)
     bench.unit_mm = 1000.0
     with pytest.raises(FreeHandStopped, match="0 images are too few"):
-        acquire_by_injection(tmp_path / "r.h5", bench.asked, bench.setup, Sweeping(bench.hand))
+        acquire_by_injection(tmp_path / "r.h5", bench.asked, bench.setup, person)
+    assert told in person.words
 
 
 def test_an_element_that_falls_silent_ends_the_run(tmp_path, bench, monkeypatch):
@@ -308,24 +319,21 @@ def test_an_element_that_falls_silent_ends_the_run(tmp_path, bench, monkeypatch)
 def test_frames_of_the_element_that_are_late_are_not_used_and_told_of(tmp_path):
     """The probe was elsewhere when they were heard: at 6 mm/s by 5 mm, with this link."""
 
-    class Waiting(Person):
+    class Delaying(Sweeping):
         def show(self, frame: np.ndarray, words: str, advice: str) -> None:
-            super().show(frame, words, "nothing heard: to and fro")
-            shown.append(words)
+            super().show(frame, words, advice)
             between.delay_s = 0.8
-            if re.search(told, words) or len(shown) == 60:
-                self._keys.append("q")
 
     told = r"the element's frames are 0\.[89] s late: check the link to it"
-    shown: list[str] = []
     bench = Bench("tcp")
+    person = Delaying(bench.hand, told, 60)
     with bench.echo, bench.images:
         between = Bridge(bench.echo.path)
         setup = replace(bench.setup, active_echo_url=between.url)
         with pytest.raises(FreeHandStopped, match="0 images are too few"):
-            acquire_by_injection(tmp_path / "r.h5", bench.asked, setup, Waiting(bench.hand))
+            acquire_by_injection(tmp_path / "r.h5", bench.asked, setup, person)
         between.close()
-    assert re.search(told, "\n".join(shown))
+    assert re.search(told, person.words)
 
 
 def test_frames_of_the_element_whose_delay_is_not_known_are_not_used_and_told_of(tmp_path):
@@ -336,22 +344,16 @@ def test_frames_of_the_element_whose_delay_is_not_known_are_not_used_and_told_of
             answer = super()._answer(word, argument)
             return "1000000,1000000" if word == "TRIG:COUN?" else answer
 
-    class Waiting(Person):
-        def show(self, frame: np.ndarray, words: str, advice: str) -> None:
-            super().show(frame, words, "nothing heard: to and fro")
-            shown.append(words)
-            if len(shown) == 20:
-                self._keys.append("q")
-
-    shown: list[str] = []
     bench = Bench()
+    person = Sweeping(bench.hand, "mm \\|", 20)
     bench.echo.__class__ = Ahead
     with bench.echo, bench.images:
         bench.hand.offset = bench.hand.aim = 0.0
         with pytest.raises(FreeHandStopped, match="0 images are too few"):
-            acquire_by_injection(tmp_path / "r.h5", bench.asked, bench.setup, Waiting(bench.hand))
-    assert "mm |" not in "".join(shown)
-    assert "delay of the element's frames is not known: check the link" in shown[-1]
+            acquire_by_injection(tmp_path / "r.h5", bench.asked, bench.setup, person)
+    assert "mm |" not in person.words
+    last = person.words.splitlines()[-1]
+    assert "delay of the element's frames is not known: check the link" in last
 
 
 def test_poses_that_a_slow_link_holds_up_are_not_those_of_the_frames_that_come_meanwhile():
@@ -390,19 +392,10 @@ def test_from_the_command_line(tmp_path, bench):
     x = np.asarray(WORLD.scene.image_to_probe, float).tolist()
     setup = tmp_path / "hand.toml"
     setup.write_text(SETUP.format(url=bench.echo.path, x=x))
-    command = "import sys; from hw.cli.main import main; sys.exit(main(sys.argv[1:]))"
     server = f"{bench.images.host}:{bench.images.port}"
-    arguments = [
-        "free-hand",
-        server,
-        "r.h5",
-        "--placement",
-        "pattern-injection",
-        "--setup",
-        str(setup),
-    ]
+    options = ["--placement", "pattern-injection", "--setup", str(setup)]
     bench.hand.offset = bench.hand.aim = -3.0
-    with Terminal(["-c", command, *arguments], tmp_path) as person:
+    with Terminal(["-m", "hw", "free-hand", server, "r.h5", *options], tmp_path) as person:
         person.wait_for(r"image 0 \(1 of 30\): the element is not heard")
         bench.hand.go(REACH_MM)
         person.wait_for(r"image 0 \(1 of 30\): +[+-]\d+\.\d\d mm \|#")

@@ -9,6 +9,7 @@ import re
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -115,13 +116,20 @@ def test_a_dry_run_shows_the_plan_and_makes_nothing(tmp_path, monkeypatch, capsy
     assert "over the cap" in capsys.readouterr().err
 
 
+def begun(path: Path, settings: dict[str, object], lacking: int | None = None) -> RecordingWriter:
+    """A recording of eight elements, or one of a plan of five poses of which some lack images."""
+    probe = {"kind": "linear", "elements": 8, "pitch_mm": 1.0, "sound_speed_m_s": 1490.0}
+    header = RecordingHeader("time_of_flight", probe, 8, settings=json.dumps(settings))
+    writer = RecordingWriter.create(path, header)
+    if lacking is not None:
+        writer.put("plan", "targets", np.tile(np.eye(4), (5, 1, 1)), "mm")
+        writer.attributes("plan", {"without_image": lacking})
+    return writer
+
+
 def test_a_recording_of_the_bench_is_resumed_on_the_bench(tmp_path, capsys):
     path = tmp_path / "rec.h5"
-    probe = {"kind": "linear", "elements": 8, "pitch_mm": 1.0, "sound_speed_m_s": 1490.0}
-    settings = json.dumps({"request": {"images": 5, "bench": 0}})
-    RecordingWriter.create(
-        path, RecordingHeader("time_of_flight", probe, 8, settings=settings)
-    ).close()
+    begun(path, {"request": {"images": 5, "bench": 0}}).close()
     assert main(["acquire", str(path), "--setup", "x.toml", "--resume", "--move"]) == 2
     assert "begun on the emulated bench" in capsys.readouterr().err
     RecordingWriter.resume(path).finish()
@@ -131,13 +139,7 @@ def test_a_recording_of_the_bench_is_resumed_on_the_bench(tmp_path, capsys):
 
 def test_a_recording_that_lacks_images_can_be_resumed_after_its_end(tmp_path):
     path, digest = tmp_path / "rec.h5", tmp_path / "rec.h5.sha256"
-    probe = {"kind": "linear", "elements": 8, "pitch_mm": 1.0, "sound_speed_m_s": 1490.0}
-    writer = RecordingWriter.create(
-        path, RecordingHeader("time_of_flight", probe, 8, settings="{}")
-    )
-    writer.put("plan", "targets", np.tile(np.eye(4), (5, 1, 1)), "mm")
-    writer.attributes("plan", {"without_image": 2})
-    writer.finish()
+    begun(path, {}, lacking=2).finish()
     assert digest.exists()
     assert read_progress(path).ended
     again = RecordingWriter.resume(path)
@@ -152,14 +154,7 @@ def test_a_recording_that_lacks_images_can_be_resumed_after_its_end(tmp_path):
 def test_a_refused_resume_leaves_a_complete_recording_as_it_is(tmp_path, capsys):
     pytest.importorskip("rtde_control", reason="ur_rtde is not installed (jaxcal[robot])")
     path = tmp_path / "rec.h5"
-    probe = {"kind": "linear", "elements": 8, "pitch_mm": 1.0, "sound_speed_m_s": 1490.0}
-    settings = json.dumps({"request": {"bench": 0, "of another version": 1}})
-    writer = RecordingWriter.create(
-        path, RecordingHeader("time_of_flight", probe, 8, settings=settings)
-    )
-    writer.put("plan", "targets", np.tile(np.eye(4), (5, 1, 1)), "mm")
-    writer.attributes("plan", {"without_image": 2})
-    writer.finish()
+    begun(path, {"request": {"bench": 0, "of another version": 1}}, lacking=2).finish()
     before = path.read_bytes()
     assert main(["acquire", str(path), "--bench", "--resume"]) == 2
     assert "has no settings of an acquisition" in capsys.readouterr().err
@@ -253,10 +248,9 @@ def test_who_confirms_is_told_of_an_arm_that_nothing_identifies():
 
 def test_a_closed_standard_error_is_no_failure(tmp_path):
     """As in some jobs without a terminal; what runs then has no other complaint either."""
-    code = "import sys; from hw.cli.main import main; sys.exit(main(sys.argv[1:]))"
     for arguments, status in ((["free-hand", "127.0.0.1:1"], 4), (["setup", "b.toml"], 0)):
         done = subprocess.run(
-            ["sh", "-c", 'exec "$@" 2>&-', "sh", sys.executable, "-c", code, *arguments],
+            ["sh", "-c", 'exec "$@" 2>&-', "sh", sys.executable, "-m", "hw", *arguments],
             cwd=tmp_path, capture_output=True, timeout=120, check=False,
         )  # fmt: skip
         assert done.returncode == status

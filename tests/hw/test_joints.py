@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 import pytest
 from robots import CB_SERIES, E_SERIES, EmulatedRobot
+from waiting import until
 
 from hw.bench.robot import model_of
 from hw.robot.kinematics import MODELS, forward, tool_of
@@ -22,10 +21,7 @@ def test_the_stream_tells_joints_that_fit_the_pose(version):
         EmulatedRobot(version=version) as robot,
         PoseStream(robot.host, clock=robot.clock) as poses,
     ):
-        give_up = time.monotonic() + 180.0
-        while not (samples := poses.drain()):
-            assert time.monotonic() < give_up
-            time.sleep(0.01)
+        samples = until(poses.drain)
     model = MODELS[model_of(version)]
     joints = samples[-1].joints
     assert joints is not None

@@ -9,6 +9,7 @@ import pytest
 pytest.importorskip("pty", reason="there are no pseudo-terminals here")
 
 from terminal import Terminal
+from waiting import until
 
 from hw.runtime.keys import names_of
 
@@ -65,10 +66,7 @@ def test_a_terminal_by_keys_and_by_lines(tmp_path):
         person.wait_for("key k\\s+key down")
         # As a shell leaves the terminal after Ctrl-Z and fg.
         person.set_modes(person.modes_before)
-        deadline = time.monotonic() + 60.0
-        while person.modes() == person.modes_before:
-            assert time.monotonic() < deadline
-            time.sleep(0.01)
+        until(lambda: person.modes() != person.modes_before)
         person.type("K")
         person.wait_for("key K")
         person.type("\r")

@@ -143,7 +143,6 @@ def test_singular_poses_are_reached_to_the_last_digit(model):
 
 def _over_axis_1(model, joints: np.ndarray) -> np.ndarray:
     """The wrist centre d4 from axis 1: joint 2 turned until it is there, by bisection."""
-    low, high = -math.pi / 2 - 1.2, -math.pi / 2 + 0.2
 
     def along(q2: float) -> float:
         q = joints.copy()

@@ -40,11 +40,11 @@ PROCEDURES = {
 each = pytest.mark.parametrize("name", sorted(PROCEDURES))
 
 
-def stages(count: int, seed: int = 0, world=None, **arguments):
+def stages(count: int, seed: int = 0, world=None, kind: type = WorldStage, **arguments):
     world = make_world(seed) if world is None else world
     rng = np.random.default_rng(seed)
-    return [WorldStage(world, pose, rng, **arguments) for pose in plan_poses(count, world.scene)
-            .poses]  # fmt: skip
+    poses = plan_poses(count, world.scene).poses
+    return [kind(world, pose, rng, **arguments) for pose in poses]
 
 
 @each
@@ -122,17 +122,11 @@ class Deaf(WorldStage):
         return heard
 
 
-def deaf(after: int) -> Deaf:
-    world = make_world(0)
-    stage = Deaf(world, plan_poses(1, world.scene).poses[0], np.random.default_rng(0))
-    stage.silent_after = after
-    return stage
-
-
 @each
 @pytest.mark.parametrize("after", [0, 3, 6, 12])
 def test_a_lost_element_ends_in_one_line_at_the_last_good_place(name, after):
-    stage = deaf(after)
+    (stage,) = stages(1, kind=Deaf)
+    stage.silent_after = after
     with pytest.raises(PlacementError) as caught:
         PROCEDURES[name](stage)
     assert "\n" not in str(caught.value)
@@ -182,17 +176,14 @@ def test_a_target_that_is_bumped_is_looked_for_again():
                 self.true_pose[:3, 3] += 2.5 * axis
             return where
 
-    world = make_world(0)
-    stage = Bumped(world, plan_poses(1, world.scene).poses[0], np.random.default_rng(0))
+    (stage,) = stages(1, kind=Bumped)
     placement = amplitude_scan(stage)
     assert placement.bracket.contains(stage.elevation_mm)
     assert "once more" in placement.notes[0]
 
 
 def test_hysteresis_that_the_approach_does_not_cover_is_told():
-    world = make_world(0)
-    pose = plan_poses(1, world.scene).poses[0]
-    stage = WorldStage(world, pose, np.random.default_rng(0), backlash_mm=2.5)
+    (stage,) = stages(1, backlash_mm=2.5)
     with pytest.raises(PlacementError, match="hysteresis"):
         amplitude_scan(stage, Settings(backlash_mm=0.0))
 
@@ -257,8 +248,7 @@ class Unplugged(WorldStage):
 
 @each
 def test_a_devices_own_error_passes_through_and_nothing_moves_any_more(name):
-    world = make_world(0)
-    stage = Unplugged(world, plan_poses(1, world.scene).poses[0], np.random.default_rng(0))
+    (stage,) = stages(1, kind=Unplugged)
     with pytest.raises(LostError, match="the port is gone"):
         PROCEDURES[name](stage)
     assert stage.moves_after == 0

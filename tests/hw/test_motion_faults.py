@@ -32,6 +32,7 @@ from motions import (
 )
 from robots import CB_SERIES, E_SERIES, EmulatedRobot
 from suspending import suspend
+from waiting import until
 
 from hw.robot.identity import stop_program
 from hw.robot.limits import CALLER_S
@@ -80,9 +81,8 @@ def fault_in_motion(
         error = future.exception(timeout=20.0)
         told = robot.clock.now() - before
     assert isinstance(error, DeviceError)
-    deadline = time.monotonic() + 5.0
-    while (state := robot.state())["rest_since"] is None and time.monotonic() < deadline:
-        time.sleep(0.01)
+    until(lambda: robot.state()["rest_since"] is not None, 5.0)
+    state = robot.state()
     assert only_asked(state)
     assert "\n" not in str(error)
     # It stopped on the way, and did not merely arrive.
@@ -184,8 +184,7 @@ def check_fault(robot: EmulatedRobot, name: str, kind: type, text: str, ends: bo
 
 
 def test_a_robot_that_is_faster_than_commanded_is_stopped(robots):
-    robot = robots["CB"]
-    put_in_order(robot)
+    robot = put_in_order(robots["CB"])
     robot.ask("overspeed", 2.0)
     with moving(robot, caller_s=2.0) as motion:
         target = farther(robot)
@@ -206,22 +205,20 @@ def test_a_robot_that_does_not_heed_a_stop_is_stopped_by_its_watchdog(robots, sp
     slow = replace(PLAN, limits=replace(PLAN.limits, max_speed_mm_s=speed_mm_s))
     with moving(robot, plan=slow, caller_s=2.0) as motion, ThreadPoolExecutor(1) as pool:
         stopping = pool.submit(motion.move_to, farther(robot))
-        while not any(robot.state()["velocity"]) and not stopping.done():
-            time.sleep(0.002)
+        until(lambda: any(robot.state()["velocity"]) or stopping.done())
         before = robot.state()["t"]
         motion.stop("danger")
         with pytest.raises(StoppedError, match=r"danger; .*still moves: press the emergency stop"):
             stopping.result(20.0)
-        while (state := robot.state())["rest_since"] is None:
-            time.sleep(0.01)
+        until(lambda: robot.state()["rest_since"] is not None)
+        state = robot.state()
     assert state["reason"].startswith("watchdog")
     assert state["rest_since"] - before < 1.5
 
 
 def test_poses_that_are_frozen_with_new_stamps_end_motion(robots):
     """Box and arrival are checked by the poses: the arm would move unseen up to its target."""
-    robot = robots["CB"]
-    put_in_order(robot)
+    robot = put_in_order(robots["CB"])
     with moving(robot, caller_s=2.0) as motion:
         target = farther(robot)
         robot.ask("freeze", True)
@@ -235,8 +232,7 @@ def test_poses_that_are_frozen_with_new_stamps_end_motion(robots):
 
 def test_nobody_is_told_that_an_arm_moves_whose_poses_are_frozen(robots):
     """Those of a moving arm, so speed included: it had come to rest long before."""
-    robot = robots["CB"]
-    put_in_order(robot)
+    robot = put_in_order(robots["CB"])
     with moving(robot, caller_s=2.0) as motion:
         error, *_ = fault_in_motion(robot, motion, partial(robot.ask, "freeze", True))
         with pytest.raises(StoppedError, match="frozen: press the emergency stop if it moves"):
@@ -247,8 +243,7 @@ def test_nobody_is_told_that_an_arm_moves_whose_poses_are_frozen(robots):
 
 def test_lost_answers_end_motion_though_poses_come(robots):
     """ur_rtde would tell 2.5 s later, and a command would wait until then."""
-    robot = robots["CB"]
-    put_in_order(robot)
+    robot = put_in_order(robots["CB"])
     with moving(robot, caller_s=2.0) as motion:
         # Wherever the arm stands: the whole way takes twice as long as the loss is seen.
         motion.move_to(PLAN.targets[0])
@@ -262,8 +257,7 @@ def test_lost_answers_end_motion_though_poses_come(robots):
 
 def test_answers_lost_while_a_command_waits_are_told_as_soon(robots):
     """The command holds the interpreter's lock of the process that sent it for seconds."""
-    robot = robots["e"]
-    put_in_order(robot)
+    robot = put_in_order(robots["e"])
     with moving(robot, caller_s=2.0) as motion:
         target = farther(robot)
         robot.ask("mute control", True)
@@ -279,8 +273,7 @@ def test_answers_lost_while_a_command_waits_are_told_as_soon(robots):
 @pytest.mark.parametrize("dashboard", [None, ""], ids=["answers", "mute"])
 def test_a_motion_does_not_go_on_when_a_safeguard_stop_is_released(robots, dashboard):
     """Such a stop only pauses the program, and may be released by closing a gate."""
-    robot = robots["e"]
-    put_in_order(robot)
+    robot = put_in_order(robots["e"])
     with moving(robot, caller_s=2.0) as motion:
 
         def fault() -> None:
@@ -366,8 +359,7 @@ def test_a_command_that_a_paused_program_did_not_take_ends_motion(robots, comman
 
 
 def test_of_two_that_connect_at_once_one_moves_the_robot(robots):
-    robot = robots["e"]
-    put_in_order(robot)
+    robot = put_in_order(robots["e"])
     moves = len(sent(robot, 3))
     target = farther(robot)
 
@@ -392,8 +384,7 @@ def test_a_program_that_is_started_while_motion_connects_is_not_replaced(robots)
     with ThreadPoolExecutor(1) as pool, ExitStack() as after:
         connecting = pool.submit(lambda: moving(robot).__enter__())
         # Once for the plan, and once more by the process that connects.
-        while robot.state()["dashboard"].count("PolyscopeVersion") < asked + 2:
-            time.sleep(0.01)
+        until(lambda: robot.state()["dashboard"].count("PolyscopeVersion") >= asked + 2)
         time.sleep(0.3)
         robot.ask("play")
         after.callback(stop_program, robot.host, timeout_s=2.0)
@@ -451,8 +442,7 @@ def until_ended(motion: Motion) -> None:
 
 
 def test_a_stop_is_told_though_the_program_ended_at_the_same_moment(robots):
-    robot = robots["CB"]
-    put_in_order(robot)
+    robot = put_in_order(robots["CB"])
     with moving(robot) as motion:
         assert motion._process is not None
         # What comes while it is held up, it sees at once.
@@ -553,8 +543,7 @@ def test_no_thread_of_the_emulated_controller_waits_behind_other_programs(robots
 
 def test_a_safety_stop_that_is_over_when_the_mover_looks_ends_motion(robots):
     """A gate that was open for a moment; the robot would go on by itself."""
-    robot = robots["e"]
-    put_in_order(robot)
+    robot = put_in_order(robots["e"])
     with moving(robot, caller_s=2.0) as motion:
         assert motion._process is not None
         suspend(motion._process.pid)
@@ -602,9 +591,7 @@ def test_a_process_that_does_not_read_a_long_setup_does_not_hold_up_the_start(mo
 
     thread = threading.Thread(target=start, daemon=True)
     thread.start()
-    while motion._process is None:
-        time.sleep(0.001)
-    process = motion._process
+    process = until(lambda: motion._process)
     suspend(process.pid)
     try:
         thread.join(5.0)

@@ -26,13 +26,14 @@ from motions import (
     SERIAL,
     STOP_WITHIN_S,
     beside,
+    confirmed,
     moving,
     sent,
 )
 from robots import CB_SERIES, START, EmulatedRobot
 from suspending import suspend
+from waiting import until
 
-from hw.robot.confirmation import confirm_unattended
 from hw.robot.identity import read_identity
 from hw.robot.motion import Motion
 from hw.robot.motion_plan import MotionPlan
@@ -92,11 +93,9 @@ def test_a_guard_that_fails_stops_the_robot():
 def test_interrupts_while_connecting_leave_no_program_on_the_robot(times):
     """It is ended in order, not by its watchdog 2 s later."""
     with EmulatedRobot(version=CB_SERIES) as robot:
-        plan = replace(PLAN, serial=read_identity(robot.host).name)
 
         def interrupt() -> None:
-            while not robot.state()["running"]:
-                time.sleep(0.001)
+            until(lambda: robot.state()["running"])
             for _ in range(times):
                 os.kill(os.getpid(), signal.SIGINT)
                 time.sleep(0.05)
@@ -115,16 +114,14 @@ def test_interrupts_while_connecting_leave_no_program_on_the_robot(times):
                         pass
 
         for _ in range(5):
-            given = confirm_unattended(plan, plan.digest, clock=robot.clock)
-            motion = Motion(robot.host, plan, given, clock=robot.clock, dry_run=False)
+            motion = confirmed(robot)
             with as_interrupts(), suppress(KeyboardInterrupt):
                 start(motion)
             if motion.serial is None:
                 break
             # A busy machine may be too late, and another try is needed.
             motion.close()
-            while robot.state()["running"]:
-                time.sleep(0.001)
+            until(lambda: not robot.state()["running"])
         else:
             pytest.fail("motion was started five times in spite of an interrupt")
         assert motion._process is not None
@@ -136,11 +133,9 @@ def test_interrupts_while_connecting_leave_no_program_on_the_robot(times):
 def test_a_mover_killed_before_its_first_command_leaves_no_program_on_the_robot():
     """The program itself ends when it hears nothing: nobody is left who could set a watchdog."""
     with EmulatedRobot(version=CB_SERIES) as robot, ThreadPoolExecutor(1) as pool:
-        plan = replace(PLAN, serial=read_identity(robot.host).name)
         for _ in range(5):
             before = robot.state()["log"]
-            given = confirm_unattended(plan, plan.digest, clock=robot.clock)
-            motion = Motion(robot.host, plan, given, clock=robot.clock, dry_run=False)
+            motion = confirmed(robot)
             starting = pool.submit(motion.start)
             while not robot.state()["loading"] and not starting.done():
                 pass
@@ -155,11 +150,9 @@ def test_a_mover_killed_before_its_first_command_leaves_no_program_on_the_robot(
         else:
             pytest.fail("motion was started five times before the kill")
         assert isinstance(failure, LostError)
-        while not robot.state()["running"]:
-            time.sleep(0.001)
-        deadline = time.monotonic() + 10.0
-        while (state := robot.state())["running"] and time.monotonic() < deadline:
-            time.sleep(0.02)
+        until(lambda: robot.state()["running"])
+        until(lambda: not robot.state()["running"], 10.0)
+        state = robot.state()
         assert state["log"] == before
         assert state["reason"].startswith("watchdog: nothing written for 2.0")
 
@@ -211,16 +204,14 @@ def test_killing_the_caller_stops_the_robot(caller_is):
             before = robot.state()["t"]
             children = Path(f"/proc/{caller.pid}/task/{caller.pid}/children").read_text().split()
             caller.kill()
-        deadline = time.monotonic() + 5.0
-        while (state := robot.state())["rest_since"] is None and time.monotonic() < deadline:
-            time.sleep(0.01)
+        until(lambda: robot.state()["rest_since"] is not None, 5.0)
+        state = robot.state()
         assert state["rest_since"] - before <= STOP_WITHIN_S
         assert state["raw"][0] < START[0] + 0.049
         # Nobody is left to end the process that moves the robot: it ends by itself.
         assert len(children) >= 1
-        while any(map(is_mover, children)) and time.monotonic() < deadline - 1.0:
-            time.sleep(0.05)
-        assert not any(map(is_mover, children))
+        # In 4 s: the child of the caller, which lives for 5, does not end it.
+        until(lambda: not any(map(is_mover, children)), 4.0)
 
 
 def is_mover(process: str) -> bool:
@@ -232,8 +223,7 @@ def is_mover(process: str) -> bool:
 
 def test_a_stop_before_the_start_or_at_rest_is_kept():
     with EmulatedRobot(version=CB_SERIES) as robot:
-        given = confirm_unattended(PLAN, PLAN.digest, clock=robot.clock)
-        motion = Motion(robot.host, PLAN, given, clock=robot.clock, dry_run=False)
+        motion = confirmed(robot)
         motion.stop("not today")
         with pytest.raises(RefusedError, match="was stopped"):
             motion.start()
@@ -293,13 +283,10 @@ def test_a_caller_that_was_suspended_while_it_connects_does_not_move(monkeypatch
 def test_a_stop_while_it_connects_is_heard():
     """At once after the setup, so that both may be read together."""
     with EmulatedRobot(version=CB_SERIES) as robot, ThreadPoolExecutor(1) as pool:
-        plan = replace(PLAN, serial=read_identity(robot.host).name)
-        given = confirm_unattended(plan, plan.digest, clock=robot.clock)
-        motion = Motion(robot.host, plan, given, clock=robot.clock, dry_run=False)
+        motion = confirmed(robot)
         with closing(motion):
             started = pool.submit(motion.start)
-            while motion._process is None:
-                time.sleep(0.001)
+            until(lambda: motion._process)
             motion.stop("the operator")
             started.result()
             assert motion._process.wait(timeout=5.0) == 1
@@ -357,10 +344,7 @@ def test_a_log_that_fails_stops_the_robot():
             raise OSError("no space left on device")
 
     with EmulatedRobot(version=CB_SERIES) as robot:
-        plan = replace(PLAN, serial=read_identity(robot.host).name)
-        given = confirm_unattended(plan, plan.digest, clock=robot.clock)
-        named = {"clock": robot.clock, "dry_run": False, "caller_s": 2.0}
-        with Motion(robot.host, plan, given, log=log, **named) as motion:
+        with confirmed(robot, log=log, caller_s=2.0) as motion:
             with pytest.raises(StoppedError, match="the log failed: OSError: no space left"):
                 motion.move_to(PLAN.targets[2])
             assert motion.ended
@@ -379,18 +363,17 @@ def test_a_log_that_hangs_does_not_hold_up_who_is_told_of_the_end(monkeypatch):
         if command == "moveL":
             hanging.wait(6.0)
 
-    with EmulatedRobot(version=CB_SERIES) as robot:
-        plan = replace(PLAN, serial=read_identity(robot.host).name)
-        given = confirm_unattended(plan, plan.digest, clock=robot.clock)
-        named = {"clock": robot.clock, "dry_run": False, "caller_s": 2.0}
-        with Motion(robot.host, plan, given, log=log, **named) as motion:
-            began = time.monotonic()
-            text = "motion process does not respond; the robot's own watchdog stops it"
-            with pytest.raises(LostError, match=text):
-                motion.move_to(PLAN.targets[2])
-            assert time.monotonic() - began < 3.0
-            assert robot.state()["velocity"] == [0.0] * 6
-            hanging.set()
+    with (
+        EmulatedRobot(version=CB_SERIES) as robot,
+        confirmed(robot, log=log, caller_s=2.0) as motion,
+    ):
+        began = time.monotonic()
+        text = "motion process does not respond; the robot's own watchdog stops it"
+        with pytest.raises(LostError, match=text):
+            motion.move_to(PLAN.targets[2])
+        assert time.monotonic() - began < 3.0
+        assert robot.state()["velocity"] == [0.0] * 6
+        hanging.set()
 
 
 def test_an_interrupt_within_what_an_interrupt_did_is_kept():

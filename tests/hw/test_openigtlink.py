@@ -6,7 +6,6 @@ import math
 import struct
 import time
 
-import jaxtyping
 import numpy as np
 import pytest
 from fastcrc.crc64 import ecma_182 as crc64
@@ -309,12 +308,6 @@ def damage(data: bytes, kind: int, rng: np.random.Generator) -> bytes:
 def body(message: Message) -> bytes:
     """What the CRC covers, whatever became of the header."""
     return encode(message)[HEADER_SIZE:]
-
-
-@pytest.fixture
-def unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without run-time type checks, which take most of the time of so many calls."""
-    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
 
 
 @pytest.mark.parametrize("count", [4000, pytest.param(100_000, marks=pytest.mark.slow)])

@@ -5,12 +5,12 @@ from __future__ import annotations
 import socket
 import struct
 import time
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 from robots import CB_SERIES, E_SERIES, START, EmulatedRobot, address
+from waiting import until
 
 from hw.bench.arm import Arm
 from hw.bench.controller import DONE, READY, Controller, before_loop
@@ -22,13 +22,6 @@ from hw.runtime.rigid import pose_to_ur, ur_to_pose
 
 rtde_receive = pytest.importorskip("rtde_receive", reason="no wheel of ur_rtde here")
 rtde_control = pytest.importorskip("rtde_control", reason="no wheel of ur_rtde here")
-
-
-def until(condition: Callable[[], object], seconds: float = 180.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "it did not happen in time"
-        time.sleep(0.005)
 
 
 def beside(mm: float) -> list[float]:

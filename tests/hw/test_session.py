@@ -9,8 +9,10 @@ import socket
 import subprocess
 import threading
 import time
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import fields, replace
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -18,6 +20,7 @@ import pytest
 from motions import PLAN, moving
 from robots import CB_SERIES, EmulatedRobot
 from test_world import placed
+from waiting import until
 
 from hw.acquisition.stage import ProbeStage
 from hw.active_echo.device import ActiveEcho
@@ -39,8 +42,40 @@ from jaxcal.io.openigtlink import Message
 pytest.importorskip("serial", reason="needs jaxcal[serial]")
 
 
+SCENE = Scene(np.eye(4), np.array([400.0, -100.0, 0.0]), np.array([0.0, 0.0, -1.0]))
+
+
 def silence(_t: float, _threshold: int) -> tuple[np.ndarray, np.ndarray]:
     return np.full(8, 50e-6), np.full(8, 900.0)
+
+
+@contextmanager
+def devices(
+    folder: Path, rate_hz: float = 30.0, **of_robot
+) -> Iterator[tuple[EmulatedRobot, AuspisEmulator, Recorder, Callable[..., Setup]]]:
+    """A robot, an element of eight lines, a recording, and the setup of them, or of a machine, too.
+
+    The setup takes the address of the machine, and the scene.
+    """
+    with (
+        EmulatedRobot(**of_robot) as robot,
+        AuspisEmulator(silence, clock=robot.clock, lines=8, rate_hz=rate_hz) as emulator,
+        Recorder(folder / "r.h5", RecordingHeader("pixel", {}, 8, settings="{}")) as recorder,
+    ):
+
+        def setup(machine: tuple[str, int] | None = None, scene: Scene = SCENE) -> Setup:
+            probe, clock = LinearProbe(elements=8), robot.clock
+            return Setup(robot.host, emulator.path, scene, {}, machine, probe=probe, clock=clock)
+
+        yield robot, emulator, recorder, setup
+
+
+def constant(_t: float) -> np.ndarray:
+    return np.zeros((40, 30), np.uint8)
+
+
+def changing(t: float) -> np.ndarray:
+    return np.full((40, 30), int(1000 * t) % 256, np.uint8)
 
 
 @pytest.mark.parametrize("name", [item.name for item in fields(SilenceLimits)])
@@ -92,57 +127,39 @@ class Link:
 
 def test_a_question_that_was_held_up_does_not_end_the_run(tmp_path):
     """The delay of the echo frames was bounded by it, and only after 10 s by another one."""
-    path = tmp_path / "r.h5"
     with (
-        EmulatedRobot() as robot,
-        AuspisEmulator(silence, clock=robot.clock, lines=8) as emulator,
-        Recorder(path, RecordingHeader("pixel", {}, 8, settings="{}")) as recorder,
+        devices(tmp_path) as (robot, emulator, recorder, setup),
+        Session(setup(), recorder) as session,
     ):
-        scene = Scene(np.eye(4), np.array([400.0, -100.0, 0.0]), np.array([0.0, 0.0, -1.0]))
-        setup = Setup(
-            robot.host, emulator.path, scene, {}, None,
-            probe=LinearProbe(elements=8), clock=robot.clock,
-        )  # fmt: skip
-        with Session(setup, recorder) as session:
-            sent = robot.clock.now()
-            time.sleep(0.6)
-            _, count = session.echo.trigger_count()
-            with session.echo._changed:  # as the first question of a session
-                session.echo._asked, session.echo._anchor = (sent, count), None
-            time.sleep(0.3)
-            assert "late: check the link" in str(session.trouble())
-            session.wait_until_clear()
-            # Of a device that has restarted, no frame was late any more.
-            emulator.restart_counter()
-            time.sleep(0.2)
-            assert "nothing tells how late echo frames are" in str(session.trouble())
-            session.wait_until_clear()
+        sent = robot.clock.now()
+        time.sleep(0.6)
+        _, count = session.echo.trigger_count()
+        with session.echo._changed:  # as the first question of a session
+            session.echo._asked, session.echo._anchor = (sent, count), None
+        time.sleep(0.3)
+        assert "late: check the link" in str(session.trouble())
+        session.wait_until_clear()
+        # Of a device that has restarted, no frame was late any more.
+        emulator.restart_counter()
+        time.sleep(0.2)
+        assert "nothing tells how late echo frames are" in str(session.trouble())
+        session.wait_until_clear()
 
 
 def test_an_image_that_a_slow_link_holds_up_is_not_of_the_next_pose(tmp_path):
     """The robot arrived after it was made: a target's place was measured at the wrong pose."""
-    scene = Scene(np.eye(4), np.array([400.0, -100.0, 0.0]), np.array([0.0, 0.0, -1.0]))
     with (
-        EmulatedRobot() as robot,
-        AuspisEmulator(silence, clock=robot.clock, lines=8) as emulator,
-        ImageServer(
-            lambda t: np.full((40, 30), int(1000 * t) % 256, np.uint8), clock=robot.clock
-        ) as machine,
-        Recorder(tmp_path / "r.h5", RecordingHeader("pixel", {}, 8, settings="{}")) as recorder,
+        devices(tmp_path) as (robot, _, recorder, setup),
+        ImageServer(changing, clock=robot.clock) as machine,
     ):
         link = Link(machine)
-        setup = Setup(
-            robot.host, emulator.path, scene, {}, link.address,
-            probe=LinearProbe(elements=8), clock=robot.clock,
-        )  # fmt: skip
-        with Session(setup, recorder) as session:
+        with Session(setup(link.address), recorder) as session:
             session.image_after(robot.clock.now())
             link.delay_s = 0.7
             time.sleep(1.0)
             arrived = robot.clock.now()
             image = session.image_after(arrived)
-            while (newest := session.latest_image()) is None or newest.t_host == image.t_host:
-                time.sleep(0.005)
+            until(lambda: session.latest_image().t_host != image.t_host)
             session.record_image(image)
     with h5py.File(tmp_path / "r.h5") as file:
         assert file["us/t_device"][()].tolist() == [image.t_device]
@@ -165,12 +182,7 @@ def test_a_frame_of_before_the_probe_came_to_rest_is_not_measured(tmp_path, monk
         monkeypatch.setattr("hw.recording.session._PERIOD_WALL_S", 0.3)
     point = (PLAN.targets[2] @ [3.0, 0.0, 45.0, 1.0])[:3]
     scene = Scene(np.eye(4), point, np.array([0.0, 0.0, -1.0]))
-    path = tmp_path / "r.h5"
-    with (
-        EmulatedRobot(version=CB_SERIES, speed=3.0) as robot,
-        AuspisEmulator(silence, clock=robot.clock, lines=8) as emulator,
-        Recorder(path, RecordingHeader("pixel", {}, 8, settings="{}")) as recorder,
-    ):
+    with devices(tmp_path, version=CB_SERIES, speed=3.0) as (robot, _, recorder, setup):
 
         def seen(t: float) -> np.ndarray:
             # A number in the corner: no two places of the arm look the same.
@@ -180,12 +192,9 @@ def test_a_frame_of_before_the_probe_came_to_rest_is_not_measured(tmp_path, monk
             return frame
 
         with ImageServer(seen, clock=robot.clock, spacing_mm=camera.spacing_mm) as machine:
-            setup = Setup(
-                robot.host, emulator.path, scene, {}, (machine.host, machine.port),
-                probe=LinearProbe(elements=8), clock=robot.clock,
-            )  # fmt: skip
+            seen_by = setup((machine.host, machine.port), scene)
             with (
-                Session(setup, recorder, watch=SilenceLimits(echo_age_s=9.0)) as session,
+                Session(seen_by, recorder, watch=SilenceLimits(echo_age_s=9.0)) as session,
                 moving(robot, caller_s=2.0) as motion,
             ):
                 session.image_after(robot.clock.now())
@@ -216,28 +225,21 @@ class Odd(ImageServer):
 
 def test_clocks_that_are_wrong_and_images_that_are_lost_are_recorded(tmp_path):
     """Ticks of another frequency than the device states are wrong times of flight."""
-    path = tmp_path / "r.h5"
-    scene = Scene(np.eye(4), np.array([400.0, -100.0, 0.0]), np.array([0.0, 0.0, -1.0]))
+    patient = SilenceLimits(image_age_s=10.0)
     with (
-        EmulatedRobot(version=CB_SERIES, speed=20.0) as robot,
-        AuspisEmulator(silence, clock=robot.clock, lines=8) as emulator,
-        Odd(lambda t: np.zeros((40, 30), np.uint8), clock=robot.clock, rate_hz=5.0) as machine,
-        Recorder(path, RecordingHeader("pixel", {}, 8, settings="{}")) as recorder,
+        devices(tmp_path, version=CB_SERIES, speed=20.0) as (robot, emulator, recorder, setup),
+        Odd(constant, clock=robot.clock, rate_hz=5.0) as machine,
     ):
         emulator.fault(clock=1.5)
-        setup = Setup(
-            robot.host, emulator.path, scene, {}, (machine.host, machine.port),
-            probe=LinearProbe(elements=8), clock=robot.clock,
-        )  # fmt: skip
-        with Session(setup, recorder, watch=SilenceLimits(image_age_s=10.0)) as session:
+        with Session(setup((machine.host, machine.port)), recorder, watch=patient) as session:
             robot.clock.sleep(DELAY_S + 2.0)
-            while len(stamps := session._stamps) < 3 or min(map(len, stamps.values())) < 25:
-                time.sleep(0.01)
+            stamps = session._stamps
+            until(lambda: len(stamps) == 3 and min(map(len, stamps.values())) >= 25)
             with pytest.raises(
                 DeviceError, match=r"counts 1\.\d+ s a second .*flight may be wrong"
             ):
                 session.listen(1, robot.clock.now())
-    with h5py.File(path) as file:
+    with h5py.File(tmp_path / "r.h5") as file:
         assert set(file["clock/device"][()]) <= {b"robot"}
         assert file["us"].attrs["lost"] >= 5
         told = dict(zip(file["events/text"], file["events/kind"], strict=True))
@@ -256,22 +258,11 @@ class RfFirst(ImageServer):
 @pytest.mark.parametrize("server", [ImageServer, RfFirst])
 def test_images_of_a_machine_that_also_sends_rf(tmp_path, server):
     """RF channel data have another size: in one recording with the images they ended the run."""
-    path = tmp_path / "r.h5"
-    scene = Scene(np.eye(4), np.array([400.0, -100.0, 0.0]), np.array([0.0, 0.0, -1.0]))
     with (
-        EmulatedRobot() as robot,
-        AuspisEmulator(silence, clock=robot.clock, lines=8) as emulator,
-        server(
-            lambda t: np.full((40, 30), int(1000 * t) % 256, np.uint8),
-            rf=lambda t: np.full((200, 8), int(1000 * t) % 1000, np.int16),
-        ) as machine,
-        Recorder(path, RecordingHeader("pixel", {}, 8, settings="{}")) as recorder,
+        devices(tmp_path) as (_, _, recorder, setup),
+        server(changing, rf=lambda t: np.full((200, 8), int(1000 * t) % 1000, np.int16)) as machine,
     ):
-        setup = Setup(
-            robot.host, emulator.path, scene, {}, (machine.host, machine.port),
-            probe=LinearProbe(elements=8), clock=robot.clock,
-        )  # fmt: skip
-        with Session(setup, recorder, every_frame=True) as session:
+        with Session(setup((machine.host, machine.port)), recorder, every_frame=True) as session:
             deadline = time.monotonic() + 60.0
             shown = {}
             while len(shown) < 10 and time.monotonic() < deadline:
@@ -284,7 +275,7 @@ def test_images_of_a_machine_that_also_sends_rf(tmp_path, server):
         assert recorder.dropped["us"] >= 3
         recorder.sync()
     assert set(shown.values()) == {np.dtype(np.uint8)}
-    with h5py.File(path) as file:
+    with h5py.File(tmp_path / "r.h5") as file:
         assert file["us/frames"].shape[1:] == (40, 30)
         assert len(file["us/frames"]) >= 10
 
@@ -292,38 +283,27 @@ def test_images_of_a_machine_that_also_sends_rf(tmp_path, server):
 def test_a_pose_that_changes_at_rest_is_no_pose_of_an_image(tmp_path):
     """A CB controller does not tell its TCP offset, which is read only before the next move."""
     pytest.importorskip("rtde_control", reason="ur_rtde has no wheel for this platform")
-    scene = Scene(np.eye(4), np.array([400.0, -100.0, 0.0]), np.array([0.0, 0.0, -1.0]))
     with (
-        EmulatedRobot(version=CB_SERIES) as robot,
-        AuspisEmulator(silence, clock=robot.clock, lines=8) as emulator,
-        Recorder(tmp_path / "r.h5", RecordingHeader("pixel", {}, 8, settings="{}")) as recorder,
+        devices(tmp_path, version=CB_SERIES) as (robot, _, recorder, setup),
+        Session(setup(), recorder) as session,
+        moving(robot, caller_s=2.0) as motion,
     ):
-        probe = LinearProbe(elements=8)
-        setup = Setup(robot.host, emulator.path, scene, {}, probe=probe, clock=robot.clock)
-        with Session(setup, recorder) as session, moving(robot, caller_s=2.0) as motion:
-            stage = ProbeStage(session, motion, PLAN.targets, lambda kind, text: None)
-            stage.go_to(1)
-            np.testing.assert_allclose(stage.resting_pose(0.1), PLAN.targets[1], atol=0.2)
-            robot.ask("tcp_offset", (0.0, 0.0, 0.102, 0.0, 0.0, 0.0))
-            with pytest.raises(RefusedError, match="set the TCP offset as before"):
-                stage.resting_pose(0.1)
+        stage = ProbeStage(session, motion, PLAN.targets, lambda kind, text: None)
+        stage.go_to(1)
+        np.testing.assert_allclose(stage.resting_pose(0.1), PLAN.targets[1], atol=0.2)
+        robot.ask("tcp_offset", (0.0, 0.0, 0.102, 0.0, 0.0, 0.0))
+        with pytest.raises(RefusedError, match="set the TCP offset as before"):
+            stage.resting_pose(0.1)
 
 
 def test_what_came_before_and_after_a_device_was_lost_is_recorded(tmp_path):
     """Frames that had just been taken from another device were lost, and all later poses."""
-    path, drained, lost_s = tmp_path / "r.h5", [], []
-    scene = Scene(np.eye(4), np.array([400.0, -100.0, 0.0]), np.array([0.0, 0.0, -1.0]))
+    drained, lost_s = [], []
     with (
-        EmulatedRobot() as robot,
-        AuspisEmulator(silence, clock=robot.clock, lines=8, rate_hz=100.0) as emulator,
-        ImageServer(lambda t: np.zeros((40, 30), np.uint8), clock=robot.clock) as machine,
-        Recorder(path, RecordingHeader("pixel", {}, 8, settings="{}")) as recorder,
+        devices(tmp_path, rate_hz=100.0) as (robot, _, recorder, setup),
+        ImageServer(constant, clock=robot.clock) as machine,
     ):
-        setup = Setup(
-            robot.host, emulator.path, scene, {}, (machine.host, machine.port),
-            probe=LinearProbe(elements=8), clock=robot.clock,
-        )  # fmt: skip
-        with Session(setup, recorder) as session:
+        with Session(setup((machine.host, machine.port)), recorder) as session:
             images, drain = session.images, session.echo.drain
             assert images is not None
 
@@ -335,27 +315,19 @@ def test_what_came_before_and_after_a_device_was_lost_is_recorded(tmp_path):
 
             session.echo.drain = lambda: drained.append(drain()) or drained[-1]
             images.drain = lost
-            while session._failure is None:
-                time.sleep(0.01)
+            until(lambda: session._failure)
             time.sleep(0.1)
         recorder.sync()
-    with h5py.File(path) as file:
+    with h5py.File(tmp_path / "r.h5") as file:
         kept = set(file["ae/frame_id"][()])
         assert {frame.frame for frames in drained for frame in frames} <= kept
         assert file["tracker/t_host"][-1] > lost_s[0] + 0.05
 
 
 def test_devices_are_closed_though_closing_was_interrupted(tmp_path, monkeypatch):
-    scene = Scene(np.eye(4), np.array([400.0, -100.0, 0.0]), np.array([0.0, 0.0, -1.0]))
-    with (
-        EmulatedRobot() as robot,
-        AuspisEmulator(silence, clock=robot.clock, lines=8) as emulator,
-        Recorder(tmp_path / "r.h5", RecordingHeader("pixel", {}, 8, settings="{}")) as recorder,
-    ):
-        probe = LinearProbe(elements=8)
-        setup = Setup(robot.host, emulator.path, scene, {}, probe=probe, clock=robot.clock)
+    with devices(tmp_path) as (_, _, recorder, setup):
         monkeypatch.setattr("hw.recording.session._PERIOD_WALL_S", 2.0)
-        session = Session(setup, recorder)
+        session = Session(setup(), recorder)
         threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
         with pytest.raises(KeyboardInterrupt):
             session.close()
@@ -366,20 +338,14 @@ def test_devices_are_closed_though_closing_was_interrupted(tmp_path, monkeypatch
 @pytest.mark.real_time
 def test_a_suspension_is_no_fault_of_a_device(tmp_path, monkeypatch):
     """A run that was suspended (Ctrl-Z) for seconds ended, and blamed the ultrasound machine."""
-    path = tmp_path / "r.h5"
     script = f"sleep 0.05; kill -STOP {os.getpid()}; sleep 1.1; kill -CONT {os.getpid()}"
-    scene = Scene(np.eye(4), np.array([400.0, -100.0, 0.0]), np.array([0.0, 0.0, -1.0]))
     with (
-        EmulatedRobot() as robot,
-        AuspisEmulator(silence, clock=robot.clock, lines=8) as emulator,
-        Recorder(path, RecordingHeader("pixel", {}, 8, settings="{}")) as recorder,
+        devices(tmp_path) as (robot, _, recorder, setup),
+        Session(setup(), recorder, watch=SilenceLimits(grace_s=0.5)) as session,
     ):
-        probe = LinearProbe(elements=8)
-        setup = Setup(robot.host, emulator.path, scene, {}, probe=probe, clock=robot.clock)
-        with Session(setup, recorder, watch=SilenceLimits(grace_s=0.5)) as session:
-            with subprocess.Popen(["sh", "-c", script]):
-                assert len(session.listen(5, robot.clock.now())) == 5
-            session.check()
-            monkeypatch.setattr("hw.recording.session._PERIOD_WALL_S", 1.0)
-            time.sleep(0.4)
-            assert "this program was suspended or held up for 0." in str(session.trouble())
+        with subprocess.Popen(["sh", "-c", script]):
+            assert len(session.listen(5, robot.clock.now())) == 5
+        session.check()
+        monkeypatch.setattr("hw.recording.session._PERIOD_WALL_S", 1.0)
+        time.sleep(0.4)
+        assert "this program was suspended or held up for 0." in str(session.trouble())

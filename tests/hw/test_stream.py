@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 from motions import put_in_order
 from robots import CB_SERIES, E_SERIES, START, EmulatedRobot, address
+from waiting import until
 
 from hw.bench.arm import Arm
 from hw.bench.rtde import RtdeServer
@@ -120,10 +121,7 @@ def test_payload_and_speed_slider_are_told(robots):
         robot.ask("payload", 0.8, (0.0, 0.0, 0.05))
         robot.ask("speed_slider", 0.5)
         expected = PendantSettings(0.8, (0.0, 0.0, 0.05), 0.5)
-        deadline = time.monotonic() + 120.0
-        while poses.pendant != expected and time.monotonic() < deadline:
-            time.sleep(0.01)
-        assert poses.pendant == expected
+        until(lambda: poses.pendant == expected)
     # Too old to tell the payload: then that is what is known, and 0 kg is something else.
     with (
         EmulatedRobot(version=(3, 10, 0, 0)) as robot,
@@ -231,8 +229,7 @@ def test_an_average_is_of_poses_from_within_its_time():
 
     def feed() -> None:
         # Once the average has begun.
-        while not stream._listeners:
-            time.sleep(0.001)
+        until(lambda: stream._listeners)
         come(START[0] + 0.01, late_s=1.0)
         while stream._listeners:
             come(START[0], late_s=0.0)

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
+from waiting import exhaust, until
 
 from hw.active_echo import ActiveEcho
 from hw.bench.active_echo import AuspisEmulator
@@ -32,21 +33,8 @@ def render(t: float) -> np.ndarray:
     return PICTURES[int(t * 1000) % 16]
 
 
-def until(condition: Callable[[], object], seconds: float = 180.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.002)
-
-
 def images_of(stream: UltrasoundStream, count: int) -> list[Image]:
     return [stream.read(PATIENCE_S) for _ in range(count)]
-
-
-def exhaust(stream: UltrasoundStream, timeout_s: float) -> None:
-    """Read until there is nothing more to read, which is always an error."""
-    while True:
-        stream.read(timeout_s)
 
 
 @pytest.fixture

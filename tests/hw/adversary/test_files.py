@@ -15,6 +15,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from test_setups import GOOD
 
 import jaxcal
 from hw.acquisition.acquire import acquire as run_acquisition
@@ -190,27 +191,7 @@ def test_heaps_without_number_or_end_take_no_time(tmp_path, complete):
 
 # -- TOML
 
-SETUP = """
-[robot]
-host = "192.168.1.10"
-[active_echo]
-url = "/dev/ttyUSB0"
-[probe]
-elements = 64
-[scene]
-image_to_probe = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 60], [0, 0, 0, 1]]
-point_mm = [350, -250, 80]
-looking = [0, 0, -1]
-[limits]
-box_min_mm = [200, -400, 40]
-box_max_mm = [500, -100, 260]
-cone_axis = [0, 0, -1]
-cone_deg = 60
-max_step_mm = 250
-max_turn_deg = 120
-max_speed_mm_s = 50
-search_mm = 5
-"""
+SETUP = GOOD.replace("[scene]", "[probe]\nelements = 64\n[scene]")
 BOMBS = {
     "dotted key": (f"a{'.b' * 60_000} = 1\n", "a key of more than 8 parts in line 1"),
     "dotted key with spaces": (f'"a" {". b" * 60_000} = 1\n', "a key of more than 8 parts"),
