@@ -181,7 +181,8 @@ class Limits:
         for item in fields(cls):
             if item.name not in values and item.default is MISSING:
                 raise refused(f"the limit {item.name} is missing")
-        return cls(**values)  # pyright: ignore[reportArgumentType]
+        checked = {name: _checked(name, value) for name, value in values.items()}
+        return cls(**checked)  # pyright: ignore[reportArgumentType]
 
 
 def _checked(name: str, value: object) -> float | str | tuple | None:

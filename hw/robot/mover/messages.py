@@ -17,6 +17,8 @@ import json
 import os
 from dataclasses import asdict, dataclass, replace
 
+import numpy as np
+
 from hw.robot.confirmation import Confirmation
 from hw.robot.limits import Limits
 from hw.robot.motion_plan import MotionPlan
@@ -58,8 +60,7 @@ class Setup:
     def message(self) -> dict:
         """The setup as the first line of the process's input."""
         given = self.confirmation
-        # The joints permit nothing, and may be others by now.
-        plan = asdict(self.plan) | {"targets": self.plan.targets.tolist(), "joints": None}
+        plan = asdict(self.plan) | {"targets": self.plan.targets.tolist()}
         told = None if given is None else {k: v for k, v in vars(given).items() if k != "use"}
         clock = asdict(self.clock)
         return {**vars(self), "plan": plan, "confirmation": told, "clock": clock}
@@ -72,11 +73,15 @@ class Setup:
             RefusedError: it holds no plan.
         """
         plan, given = message["plan"], message["confirmation"]
-        limits, pendant = Limits.from_mapping(plan["limits"]), PendantSettings(**plan["pendant"])
-        if pendant.payload_cog_m is not None:
-            pendant = replace(pendant, payload_cog_m=tuple(pendant.payload_cog_m))
+        cog = plan["pendant"]["payload_cog_m"]
+        cog = None if cog is None else tuple(cog)
+        pendant = PendantSettings(**{**plan["pendant"], "payload_cog_m": cog})
+        limits, offset = Limits.from_mapping(plan["limits"]), tuple(plan["tcp_offset"])
         made = {
-            "plan": MotionPlan(**{**plan, "limits": limits, "pendant": pendant}),
+            # Without joints: they permit nothing, and may be others by now.
+            "plan": MotionPlan(
+                np.array(plan["targets"]), limits, offset, plan["serial"], pendant=pendant
+            ),
             "confirmation": None if given is None else Confirmation(**given),
             "clock": Clock(**message["clock"]),
         }
