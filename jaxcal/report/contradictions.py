@@ -28,7 +28,7 @@ The covariance assumes that the noise model holds. It is contradicted if
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from jaxcal.diagnostics.misfits import DRIFT_SCORE, in_two_groups
@@ -37,6 +37,9 @@ from jaxcal.diagnostics.unmodelled import SIDE_MM
 from jaxcal.diagnostics.warnings import IMPLAUSIBLE_RMS_MM
 from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
 from jaxcal.solvers.plan import TUNED
+
+Found = Iterator[tuple[float, str]]
+"""How many times as large as stated a contradiction makes the error, and its words."""
 
 CHANCE = 3.0
 """SDs of chance beyond which the residuals contradict the stated error."""
@@ -53,7 +56,7 @@ LIMITS_TIMES = 1.25
 Gaussian offsets than so many times the error of that fit."""
 SCATTER_TIMES = 1.3
 """Resampled calibrations may scatter by up to so many times the stated error; with fewer than about
-40 images by more (:func:`_largest_scatter`)."""
+40 images by more (:func:`_scattered`)."""
 
 SLOW = 0.5
 """Least slowness of a slow path (:func:`jaxcal.calibration.serial_correlation.slowness`)."""
@@ -71,21 +74,65 @@ _WORTH_NAMING = 0.1
 _WAYS = {"lateral": "sideways", "range": "in depth"}
 """Errors within the image, in the order of the residuals, and in words."""
 
-
-def _sd(record: dict[str, Any], kind: str) -> float | None:
-    """SD of an image's errors of one kind, those of the tracker included, mm."""
-    size = record[f"sigma_{kind}_mm"]
-    return None if size is None else math.hypot(size, record["tracker_sd_mm"] or 0.0)
-
-
-def _too_long(share: float) -> str:
-    """By how much a length is wrong, as a share of it."""
-    return _too("long", "short", 100 * share, "%")
-
-
-def _too(positive: str, negative: str, size: float, unit: str) -> str:
-    """By how much something is wrong, and in which direction."""
-    return f"too {negative if size < 0 else positive} by {abs(size):.1f} {unit}"
+_EXPLANATIONS = {
+    "lateral": (
+        "lateral positions that are {long}",
+        "are the pixels as wide as stated? With a curved array, a wrong sound speed stretches the "
+        "image sideways, too: estimate the scale, not the sound speed",
+    ),
+    "slip": (
+        "an image that moves by {slip_mm:.1f} mm on the probe from the first image to the last",
+        "a slipping mount, or a moving target?",
+    ),
+    "step": (
+        "an image that moves by {slip_mm:.1f} mm on the probe near image {image} (counted from 0)",
+        "has the mount slipped there, the target moved, or the image's depth changed? Calibrate "
+        "from the images before it, or after it",
+    ),
+    "displaced": (
+        "a target that moves by {length:.1f} mm near image {image} (counted from 0)",
+        "was it touched there, or the tracker or its reference? Calibrate from the images before "
+        "it, or after it",
+    ),
+    "skew": (
+        "lateral positions that are {large} of the depth",
+        "a steered beam, or clicks beside the target?",
+    ),
+    "curve": (
+        f"ranges that are {{long_mm}} {SIDE_MM:.0f} mm to either side of the middle",
+        "a curved array taken for a straight one, or the delays of another probe?",
+    ),
+    "speed": (
+        "distances that are {long}",
+        "is it the sound speed of this water? Estimate it (--estimate sound-speed)",
+    ),
+    "beside": (
+        "a target {values[0]:.1f} mm beside the image plane in all images",
+        "take images from both sides of it",
+    ),
+    "distortion": (
+        "tracked positions that are off by {values[0]:.1f} mm (RMS), by nearly the same where the "
+        "probe is nearly in the same place,",
+        "metal near an electromagnetic tracker, the edge of its range, or, along a single path, "
+        "errors that change slowly? Record again without it: more images hardly help",
+    ),
+    "marker": (
+        "an image that moves by {values[0]:.1f} mm (RMS) on the probe with the probe's orientation",
+        "are the probe's markers wrong, or partly hidden, from some sides, does the target look "
+        "different from them, or, along a single path, do errors change slowly?",
+    ),
+    "targets": (
+        "a second target, {values[0]:.1f} mm from the first one, in images {named}",
+        "were two targets, or two echoes of one, marked in turn?",
+    ),
+    "origins": (
+        "points that are off by {values[0]:.1f} mm sideways and {values[1]:.1f} mm in depth in "
+        "images {named}",
+        "were these images cropped or zoomed in another way, or another echo marked in them?",
+    ),
+}
+"""What would explain the errors, and what to ask or to do about it, by the kind of an error that
+the model leaves out. Those of ``scale`` and ``lag`` have functions of their own."""
 
 
 def contradictions(record: dict[str, Any]) -> list[tuple[float, str]]:
@@ -95,64 +142,59 @@ def contradictions(record: dict[str, Any]) -> list[tuple[float, str]]:
     were requested. Groups and slow changes of the errors have no words of their own ("") where one
     of :data:`SHIFTS` explains them.
     """
-    checks = (
-        _from_large_residuals,
-        _from_repeated_poses,
-        _from_residuals,
-        _from_images,
-        _from_resampling,
-        _from_test_images,
-        _from_slow_changes,
-        _from_unmodelled,
-        _from_groups,
-        _from_absorbed_offsets,
-        _from_clipped,
-        _from_left_out,
-        _from_limits,
-    )
-    found = [pair for check in checks for pair in check(record)]
-    if (record["tre"]["unmodelled"] or {}).get("kind") not in SHIFTS:
-        return found
-    effects = _from_slow_changes(record) + _from_groups(record)
-    return [(times, "" if (times, words) in effects else words) for times, words in found]
+    if not record["tre"]["stated_mm"]:
+        return []
+    shifted = (record["tre"]["unmodelled"] or {}).get("kind") in SHIFTS
+    return [
+        (times, "" if shifted and check in (_from_slow_changes, _from_groups) else words)
+        for check in _CHECKS
+        for times, words in check(record)
+    ]
 
 
-def _from_large_residuals(record: dict[str, Any]) -> list[tuple[float, str]]:
+def _beside(size: float, record: dict[str, Any]) -> float:
+    """How many times as large as stated the error is with a further one of this size, mm."""
+    return math.hypot(1.0, size / record["tre"]["stated_mm"])
+
+
+def _sd(record: dict[str, Any], kind: str) -> float | None:
+    """SD of an image's errors of one kind, those of the tracker included, mm."""
+    size = record[f"sigma_{kind}_mm"]
+    return None if size is None else math.hypot(size, record["tracker_sd_mm"] or 0.0)
+
+
+def _from_large_residuals(record: dict[str, Any]) -> Found:
     """Residuals that no beam explains, whatever the covariance takes them for.
 
     Out of the image plane they would pass for offsets, which may have any SD.
     """
-    rms, stated = record["rms_mm"], record["tre"]["stated_mm"]
-    if not rms or not stated or rms <= IMPLAUSIBLE_RMS_MM:
-        return []
-    return [(rms / stated, f"residuals of {rms:.1f} mm are larger than a beam is thick")]
+    rms = record["rms_mm"]
+    if rms and rms > IMPLAUSIBLE_RMS_MM:
+        words = f"residuals of {rms:.1f} mm are larger than a beam is thick"
+        yield rms / record["tre"]["stated_mm"], words
 
 
-def _from_repeated_poses(record: dict[str, Any]) -> list[tuple[float, str]]:
+def _from_repeated_poses(record: dict[str, Any]) -> Found:
     """Frames of one pose that counted as independent images, as in a batch."""
     used, poses = record["images_used"], record["tre"]["different_poses"]
-    if not poses or poses == used:
-        return []
-    words = f"{used} images with {poses} different poses were counted as independent"
-    return [(math.sqrt(used / poses), words)]
+    if poses and poses != used:
+        words = f"{used} images with {poses} different poses were counted as independent"
+        yield math.sqrt(used / poses), words
 
 
-def _from_residuals(record: dict[str, Any]) -> list[tuple[float, str]]:
+def _from_residuals(record: dict[str, Any]) -> Found:
     """Residuals that are too large where they matter, one by one.
 
     They are compared with what their SDs make of the error, before errors that are alike in
     successive images and doubt about the offsets' distribution widen the covariance. The factor is
     applied to the wider error, since neither of the two is seen in single residuals.
     """
-    tre = record["tre"]
-    ratio, chance = tre["residuals_over_stated"], tre["chance"]
-    if ratio is None or chance is None or ratio**2 <= 1 + CHANCE * chance:
-        return []
-    words = f"the residuals make the error {ratio:.1f} times as large as their SDs do"
-    return [(ratio, words)]
+    ratio, chance = record["tre"]["residuals_over_stated"], record["tre"]["chance"]
+    if ratio is not None and chance is not None and ratio**2 > 1 + CHANCE * chance:
+        yield ratio, f"the residuals make the error {ratio:.1f} times as large as their SDs do"
 
 
-def _from_images(record: dict[str, Any]) -> list[tuple[float, str]]:
+def _from_images(record: dict[str, Any]) -> Found:
     """The image that moves the answer most, if too much; by cross-validation if there is one."""
     stated, influence = record["tre"]["stated_mm"], record["influence"]
     held = _comparable_folds(record)
@@ -165,26 +207,24 @@ def _from_images(record: dict[str, Any]) -> list[tuple[float, str]]:
         if by is not None and should is not None
         if by > max(MOVED_SHARE * stated, MOVED_TIMES * should)
     ]
-    if not found:
-        return []
-    size, worst = max(found)
-    words = f"image {worst} alone changes the calibration by {size:.2f} mm in the image ({how})"
-    return [(math.hypot(1.0, size / stated), words)]
+    if found:
+        size, worst = max(found)
+        words = f"image {worst} alone changes the calibration by {size:.2f} mm in the image ({how})"
+        yield _beside(size, record), words
 
 
-def _from_test_images(record: dict[str, Any]) -> list[tuple[float, str]]:
+def _from_test_images(record: dict[str, Any]) -> Found:
     """Independent images among which the target scatters by far more than it may."""
-    found, stated = record["reconstruction_precision_mm"], record["tre"]["stated_mm"]
-    if record["reconstruction_precision_set"] != "test" or found is None or not stated:
-        return []
+    found = record["reconstruction_precision_mm"]
+    if record["reconstruction_precision_set"] != "test" or found is None:
+        return
     errors, expected = _of_test_images(record)
-    if found <= TEST_TIMES * expected or outlying_test_images(record):
-        return []
-    words = (
-        f"the test images scatter by {found:.2f} mm, where {expected:.2f} mm is expected (is it "
-        "the same probe, depth and mount?)"
-    )
-    return [(math.sqrt(found**2 - errors**2) / stated, words)]
+    if found > TEST_TIMES * expected and not outlying_test_images(record):
+        words = (
+            f"the test images scatter by {found:.2f} mm, where {expected:.2f} mm is expected (is "
+            "it the same probe, depth and mount?)"
+        )
+        yield math.sqrt(found**2 - errors**2) / record["tre"]["stated_mm"], words
 
 
 def _of_test_images(record: dict[str, Any]) -> tuple[float, float]:
@@ -210,32 +250,30 @@ def outlying_test_images(record: dict[str, Any]) -> list[int]:
     return outlying if few and math.hypot(*rest) <= limit * math.sqrt(len(rest) - 1) else []
 
 
-def _from_slow_changes(record: dict[str, Any]) -> list[tuple[float, str]]:
+def _from_slow_changes(record: dict[str, Any]) -> Found:
     """Points that move in the image in the course of the recording, as after a slip of the mount.
 
     Slow elevational errors do not count: they come from the placement, not from the image.
     """
-    stated, scores = record["tre"]["stated_mm"], record["noise_model"]["scores"]["drift"]
-    found: list[tuple[float, str]] = []
+    scores = record["noise_model"]["scores"]["drift"]
     for score, (kind, name) in zip(scores[:2], _WAYS.items(), strict=True):
         size = _sd(record, kind)
-        if score is None or not size or not stated or score <= DRIFT_SCORE:
+        if score is None or not size or score <= DRIFT_SCORE:
             continue
         slow = size * math.sqrt(min(score / math.sqrt(record["images_used"] - 1), 1.0))
-        words = (
-            f"the points move {name} by {slow:.2f} mm (SD) in the course of the recording, so that "
-            "the calibration at its end is not that at its start"
-        )
-        if slow > stated:
-            found.append((math.hypot(1.0, slow / stated), words))
-    return found
+        if slow > record["tre"]["stated_mm"]:
+            words = (
+                f"the points move {name} by {slow:.2f} mm (SD) in the course of the recording, so "
+                "that the calibration at its end is not that at its start"
+            )
+            yield _beside(slow, record), words
 
 
-def _from_unmodelled(record: dict[str, Any]) -> list[tuple[float, str]]:
+def _from_unmodelled(record: dict[str, Any]) -> Found:
     """An error that the model leaves out, and that the residuals show."""
-    found, stated = record["tre"]["unmodelled"], record["tre"]["stated_mm"]
-    if found is None or not stated:
-        return []
+    found = record["tre"]["unmodelled"]
+    if found is None:
+        return
     moved = found["moved_mm"]
     if found["kind"] in ("targets", "origins"):
         # To first order the answer moves by less than it is wrong by, which in simulation was
@@ -247,7 +285,7 @@ def _from_unmodelled(record: dict[str, Any]) -> list[tuple[float, str]]:
     if found["also"] is not None:
         what, advice = _explanation(found["also"], pixels=pixels)
         words += f"; so would {what}: {advice}"
-    return [(math.hypot(1.0, moved / stated), words)]
+    yield _beside(moved, record), words
 
 
 def _explanation(found: dict[str, Any], *, pixels: bool) -> tuple[str, str]:
@@ -258,110 +296,62 @@ def _explanation(found: dict[str, Any], *, pixels: bool) -> tuple[str, str]:
         pixels: whether the calibration has pixels.
     """
     values = found["values"]
-    those = f"images {images_named(found['images'] or ())}"
-    match found["kind"]:
-        case "scale":
-            least = _WORTH_NAMING * max(map(abs, values))
-            lengths = ("lateral positions", values[0]), ("ranges", values[1])
-            told = [f"{what} that are {_too_long(by)}" for what, by in lengths if abs(by) >= least]
-            points = (
-                "check pixel size and sound speed, or estimate the scale"
-                if pixels
-                else "check what gave the points their mm (pixel size, sound speed, pitch of the "
-                "elements)"
-            )
-            if (share := found["tracker_share"]) is None:
-                return " and ".join(told), points
-            return (
-                " and ".join(told),
-                f"{points}; if they are right, tracked positions are {_too_long(-share)} (check "
-                "the tracker with a known distance, and the size of its markers)",
-            )
-        case "lateral":
-            return (
-                f"lateral positions that are {_too_long(values[0])}",
-                "are the pixels as wide as stated? With a curved array, a wrong sound speed "
-                "stretches the image sideways, too: estimate the scale, not the sound speed",
-            )
-        case "slip":
-            return (
-                f"an image that moves by {found['slip_mm']:.1f} mm on the probe from the first "
-                "image to the last",
-                "a slipping mount, or a moving target?",
-            )
-        case "step":
-            return (
-                f"an image that moves by {found['slip_mm']:.1f} mm on the probe near image "
-                f"{found['image']} (counted from 0)",
-                "has the mount slipped there, the target moved, or the image's depth changed? "
-                "Calibrate from the images before it, or after it",
-            )
-        case "displaced":
-            return (
-                f"a target that moves by {math.hypot(*values):.1f} mm near image {found['image']} "
-                "(counted from 0)",
-                "was it touched there, or the tracker or its reference? Calibrate from the images "
-                "before it, or after it",
-            )
-        case "lag":
-            late, early = ("images", "poses") if values[0] > 0 else ("poses", "images")
-            larger = "larger" if values[0] > 0 else "smaller"
-            lag = f"{abs(values[0]):.3f} s"
-            return (
-                f"{late} that lag {lag} behind their {early}",
-                f"import again with a --lag that is {lag} {larger}, or hold the probe still for "
-                "each image",
-            )
-        case "skew":
-            return (
-                f"lateral positions that are {_too('large', 'small', 100 * values[0], '%')} of the "
-                "depth",
-                "a steered beam, or clicks beside the target?",
-            )
-        case "curve":
-            return (
-                f"ranges that are {_too('long', 'short', values[0], 'mm')} {SIDE_MM:.0f} mm to "
-                "either side of the middle",
-                "a curved array taken for a straight one, or the delays of another probe?",
-            )
-        case "speed":
-            return (
-                f"distances that are {_too_long(values[0])}",
-                "is it the sound speed of this water? Estimate it (--estimate sound-speed)",
-            )
-        case "beside":
-            return (
-                f"a target {values[0]:.1f} mm beside the image plane in all images",
-                "take images from both sides of it",
-            )
-        case "distortion":
-            return (
-                f"tracked positions that are off by {values[0]:.1f} mm (RMS), by nearly the same "
-                "where the probe is nearly in the same place,",
-                "metal near an electromagnetic tracker, the edge of its range, or, along a single "
-                "path, errors that change slowly? Record again without it: more images hardly help",
-            )
-        case "marker":
-            return (
-                f"an image that moves by {values[0]:.1f} mm (RMS) on the probe with the probe's "
-                "orientation",
-                "are the probe's markers wrong, or partly hidden, from some sides, does the target "
-                "look different from them, or, along a single path, do errors change slowly?",
-            )
-        case "targets":
-            return (
-                f"a second target, {values[0]:.1f} mm from the first one, in {those}",
-                "were two targets, or two echoes of one, marked in turn?",
-            )
-        case "origins":
-            return (
-                f"points that are off by {values[0]:.1f} mm sideways and {values[1]:.1f} mm in "
-                f"depth in {those}",
-                "were these images cropped or zoomed in another way, or another echo marked in "
-                "them?",
-            )
-        case kind:
-            raise AssertionError(kind)
+    if found["kind"] == "scale":
+        return _wrong_lengths(values, found["tracker_share"], pixels=pixels)
+    if found["kind"] == "lag":
+        return _lagging(values[0])
+    what, advice = _EXPLANATIONS[found["kind"]]
+    told = what.format(
+        **found,
+        long=_too_long(values[0]),
+        long_mm=_too("long", "short", values[0], "mm"),
+        large=_too("large", "small", 100 * values[0], "%"),
+        length=math.hypot(*values),
+        named=images_named(found["images"] or ()),
+    )
+    return told, advice
+
+
+def _wrong_lengths(
+    shares: Sequence[float], tracker_share: float | None, *, pixels: bool
+) -> tuple[str, str]:
+    """Of ``scale``: lateral positions and ranges that are too long by these shares."""
+    least = _WORTH_NAMING * max(map(abs, shares))
+    lengths = zip(("lateral positions", "ranges"), shares, strict=True)
+    told = [f"{what} that are {_too_long(by)}" for what, by in lengths if abs(by) >= least]
+    advice = (
+        "check pixel size and sound speed, or estimate the scale"
+        if pixels
+        else "check what gave the points their mm (pixel size, sound speed, pitch of the elements)"
+    )
+    if tracker_share is not None:
+        advice += (
+            f"; if they are right, tracked positions are {_too_long(-tracker_share)} (check the "
+            "tracker with a known distance, and the size of its markers)"
+        )
+    return " and ".join(told), advice
+
+
+def _lagging(seconds: float) -> tuple[str, str]:
+    """Of ``lag``: images that lag behind their poses, or, if it is negative, poses that do."""
+    late, early, larger = "images", "poses", "larger"
+    if seconds <= 0:
+        late, early, larger = "poses", "images", "smaller"
+    lag = f"{abs(seconds):.3f} s"
+    return (
+        f"{late} that lag {lag} behind their {early}",
+        f"import again with a --lag that is {lag} {larger}, or hold the probe still for each image",
+    )
+
+
+def _too_long(share: float) -> str:
+    """By how much a length is wrong, as a share of it."""
+    return _too("long", "short", 100 * share, "%")
+
+
+def _too(positive: str, negative: str, size: float, unit: str) -> str:
+    """By how much something is wrong, and in which direction."""
+    return f"too {negative if size < 0 else positive} by {abs(size):.1f} {unit}"
 
 
 def images_named(images: Sequence[int]) -> str:
@@ -370,72 +360,62 @@ def images_named(images: Sequence[int]) -> str:
     return f"{', '.join([*map(str, images[:MOST_IMAGES]), *more])} (counted from 0)"
 
 
-def _from_groups(record: dict[str, Any]) -> list[tuple[float, str]]:
+def _from_groups(record: dict[str, Any]) -> Found:
     """Errors within the image that come in two groups."""
-    stated, model = record["tre"]["stated_mm"], record["noise_model"]
-    scores, kurtosis = model["scores"]["tails"], model["kurtosis"]
-    found: list[tuple[float, str]] = []
-    for k, (kind, name) in enumerate(_WAYS.items()):
-        size = _sd(record, kind)
-        if stated and size and in_two_groups(scores[k], kurtosis[k]):
+    model = record["noise_model"]
+    each = zip(_WAYS.items(), model["scores"]["tails"], model["kurtosis"], strict=False)
+    for (kind, name), score, kurtosis in each:
+        if (size := _sd(record, kind)) and in_two_groups(score, kurtosis):
             words = f"the points lie in two groups, about {2 * size:.1f} mm apart {name}"
-            found.append((math.hypot(1.0, size / stated), words))
-    return found
+            yield _beside(size, record), words
 
 
-def _from_left_out(record: dict[str, Any]) -> list[tuple[float, str]]:
+def _from_left_out(record: dict[str, Any]) -> Found:
     """Images left out that agree among themselves as well as those in use do."""
-    found, stated = record["tre"]["left_out"], record["tre"]["stated_mm"]
-    if found is None or not stated:
-        return []
-    words = (
-        f"the {found['images']} images left out agree among themselves, but on a calibration "
-        f"{found['apart_mm']:.1f} mm away: which of the two is right?"
-    )
-    return [(math.hypot(1.0, found["apart_mm"] / stated), words)]
+    if (found := record["tre"]["left_out"]) is not None:
+        words = (
+            f"the {found['images']} images left out agree among themselves, but on a calibration "
+            f"{found['apart_mm']:.1f} mm away: which of the two is right?"
+        )
+        yield _beside(found["apart_mm"], record), words
 
 
-def _from_absorbed_offsets(record: dict[str, Any]) -> list[tuple[float, str]]:
+def _from_absorbed_offsets(record: dict[str, Any]) -> Found:
     """Offsets that the answer has taken up: as large as the other errors, as far as one knows."""
-    slow, offsets = record["tre"]["slow_path"], record["sigma_elevation_mm"]
-    others = [size for kind in ("lateral", "range") if (size := record[f"sigma_{kind}_mm"])]
-    if slow < SLOW or not (offsets and len(others) == 2):
-        return []
-    if offsets >= ABSORBED_SHARE * min(others):
-        return []
-    words = (
-        f"offsets from the image plane with an SD of {offsets:.1g} mm, where other errors have "
-        f"{min(others):.2f} mm, are too small to be true: the images lie along one slow path, and "
-        "the calibration has taken up the offsets that changed as slowly (take images in other "
-        "poses, in a random order)"
-    )
-    return [(min(others) / offsets, words)]
+    offsets = record["sigma_elevation_mm"]
+    others = [size for kind in _WAYS if (size := record[f"sigma_{kind}_mm"])]
+    if record["tre"]["slow_path"] < SLOW or not (offsets and len(others) == 2):
+        return
+    if offsets < ABSORBED_SHARE * min(others):
+        words = (
+            f"offsets from the image plane with an SD of {offsets:.1g} mm, where other errors have "
+            f"{min(others):.2f} mm, are too small to be true: the images lie along one slow path, "
+            "and the calibration has taken up the offsets that changed as slowly (take images in "
+            "other poses, in a random order)"
+        )
+        yield min(others) / offsets, words
 
 
-def _from_clipped(record: dict[str, Any]) -> list[tuple[float, str]]:
+def _from_clipped(record: dict[str, Any]) -> Found:
     """Points that were cut off at an edge, beyond which the target was in some images."""
-    found, stated = record["tre"]["clipped"], record["tre"]["stated_mm"]
-    if found is None or not stated:
-        return []
-    pixels = record["tre"]["unit"] == "px"
-    name = (("u", "v") if pixels else ("lateral position", "range"))[found["axis"]]
+    found, unit = record["tre"]["clipped"], record["tre"]["unit"]
+    if found is None:
+        return
+    name = (("u", "v") if unit == "px" else ("lateral position", "range"))[found["axis"]]
     end, beyond = ("largest", "larger") if found["largest"] else ("smallest", "smaller")
     words = (
-        f"{len(found['images'])} images share the {end} {name}, {found['value']:.6g} "
-        f"{record['tre']['unit']}: were {beyond} ones cut off (by a region of interest, or the "
-        f"edge of the image)? Calibrate without images {images_named(found['images'])}"
+        f"{len(found['images'])} images share the {end} {name}, {found['value']:.6g} {unit}: were "
+        f"{beyond} ones cut off (by a region of interest, or the edge of the image)? Calibrate "
+        f"without images {images_named(found['images'])}"
     )
-    return [(math.hypot(1.0, (found["apart_mm"] or 0.0) / stated), words)]
+    yield _beside(found["apart_mm"] or 0.0, record), words
 
 
-def _from_limits(record: dict[str, Any]) -> list[tuple[float, str]]:
+def _from_limits(record: dict[str, Any]) -> Found:
     """An answer that sharp limits of the offsets have moved."""
-    found, stated = record["tre"]["gaussian_offsets"], record["tre"]["stated_mm"]
-    if found is None or not stated:
-        return []
-    apart, error = found["apart_mm"], found["error_mm"]
-    if apart <= LIMITS_TIMES * error:
-        return []
+    found = record["tre"]["gaussian_offsets"]
+    if found is None or found["apart_mm"] <= LIMITS_TIMES * found["error_mm"]:
+        return
     better = "use the prior auto, unless something limits the offsets on both sides"
     if record["prior"] == "bounded":
         better = (
@@ -443,18 +423,10 @@ def _from_limits(record: dict[str, Any]) -> list[tuple[float, str]]:
             "the answer, and even the right one may leave it less accurate)"
         )
     words = (
-        f"a calibration with Gaussian offsets differs by {apart:.2f} mm, where its own error would "
-        f"be {error:.2f} mm: {better}"
+        f"a calibration with Gaussian offsets differs by {found['apart_mm']:.2f} mm, where its own "
+        f"error would be {found['error_mm']:.2f} mm: {better}"
     )
-    return [(math.hypot(1.0, apart / stated), words)]
-
-
-def _scatter(scatter: float, stated: float) -> str:
-    """Words for a scatter at corners and middle of the part in which targets were seen, mm."""
-    return (
-        f"scatter by {scatter:.2f} mm where targets were seen, {scatter / stated:.1f} times as "
-        f"much as the covariance states ({stated:.2f} mm)"
-    )
+    yield _beside(found["apart_mm"], record), words
 
 
 def _each_used(held: dict[str, Any]) -> list[float]:
@@ -476,34 +448,57 @@ def _comparable_folds(record: dict[str, Any]) -> dict[str, Any] | None:
     return None if other else held
 
 
-def _largest_scatter(stated: float, count: int) -> float:
-    """The largest scatter of resampled calibrations that does not contradict the stated error, mm.
-
-    The variance of a scatter that comes from so many images has a relative SD of about
-    sqrt(2 / (count - 1)).
-    """
-    by_chance = math.sqrt(1 + CHANCE * math.sqrt(2 / (count - 1)))
-    return max(SCATTER_TIMES, by_chance) * stated
-
-
-def _from_resampling(record: dict[str, Any]) -> list[tuple[float, str]]:
-    found: list[tuple[float, str]] = []
+def _from_resampling(record: dict[str, Any]) -> Found:
+    """Calibrations of a cross-validation or a bootstrap that scatter more than is stated."""
     held, drawn = _comparable_folds(record), record.get("bootstrap")
     if held is not None and held["folds"] == held["folds_converged"]:
         # The jackknife. All images of a fold are held out together; the first ones in use are of a
         # fold each.
-        folds, stated = held["folds"], held["stated_mm"]
+        folds = held["folds"]
         moved = _each_used(held)[:folds]
         scatter = math.sqrt((folds - 1) / folds * sum(by**2 for by in moved))
-        if stated and scatter > _largest_scatter(stated, folds):
-            words = f"the calibrations of the cross-validation {_scatter(scatter, stated)}"
-            found.append((scatter / stated, words))
+        yield from _scattered("cross-validation", scatter, held["stated_mm"], folds)
     # A resample of n images has about 0.63 n different ones.
-    if drawn is not None and drawn["stated_mm"] and record["images_used"] >= FEWEST_TO_CHECK:
+    if drawn is not None and record["images_used"] >= FEWEST_TO_CHECK:
         known = [value for value in drawn["rms_scatter_mm"] if value is not None]
         scatter = math.sqrt(sum(value**2 for value in known) / max(len(known), 1))
-        stated = drawn["stated_mm"]
-        if scatter > _largest_scatter(stated, record["images_used"]):
-            words = f"the calibrations of the bootstrap {_scatter(scatter, stated)}"
-            found.append((scatter / stated, words))
-    return found
+        yield from _scattered("bootstrap", scatter, drawn["stated_mm"], record["images_used"])
+
+
+def _scattered(of: str, scatter: float, stated: float | None, count: int) -> Found:
+    """A scatter that contradicts the error stated for the same points.
+
+    The variance of a scatter that comes from so many images has a relative SD of about
+    sqrt(2 / (count - 1)).
+
+    Args:
+        of: what the calibrations are of.
+        scatter: at corners and middle of the part in which targets were seen, mm.
+        stated: the error there, mm.
+        count: of images, or folds, from which the scatter comes.
+    """
+    by_chance = math.sqrt(1 + CHANCE * math.sqrt(2 / (count - 1)))
+    if stated and scatter > max(SCATTER_TIMES, by_chance) * stated:
+        words = (
+            f"the calibrations of the {of} scatter by {scatter:.2f} mm where targets were seen, "
+            f"{scatter / stated:.1f} times as much as the covariance states ({stated:.2f} mm)"
+        )
+        yield scatter / stated, words
+
+
+_CHECKS = (
+    _from_large_residuals,
+    _from_repeated_poses,
+    _from_residuals,
+    _from_images,
+    _from_resampling,
+    _from_test_images,
+    _from_slow_changes,
+    _from_unmodelled,
+    _from_groups,
+    _from_absorbed_offsets,
+    _from_clipped,
+    _from_left_out,
+    _from_limits,
+)
+"""In the order in which their words are said."""
