@@ -163,10 +163,7 @@ def _convergence(
 
 
 def _observability(
-    design: Float[np.ndarray, "p p"],
-    variance: float,
-    lever: Float[np.ndarray, ""],
-    blocks: Blocks,
+    design: Float[np.ndarray, "p p"], variance: float, lever: Float[np.ndarray, ""], blocks: Blocks
 ) -> Literal["degenerate", "weak", "known"]:
     """Which directions are known, in mm at the target, as in :mod:`jaxcal.calibration.answer`."""
     eps = float(np.finfo(float).eps)

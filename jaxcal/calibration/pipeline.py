@@ -100,10 +100,7 @@ def _rigid(poses: Float[Array, "batch n 4 4"]) -> Bool[Array, "batch n"]:
 
 
 def _solved(
-    problems: Problem,
-    given: Given,
-    plan: SolvePlan,
-    begun: ConventionalStart | None = None,
+    problems: Problem, given: Given, plan: SolvePlan, begun: ConventionalStart | None = None
 ) -> Calibration:
     images = ImagePlanes.of(problems, channels=plan.channels)
     found = methods.solve(problems, images, given, plan, begun)

@@ -13,14 +13,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import click
 
 from jaxcal import InputError, OutputError
-from jaxcal.cli.common import (
-    Commands,
-    ExitCode,
-    json_option,
-    print_json,
-    print_page,
-    progress,
-)
+from jaxcal.cli.common import Commands, ExitCode, json_option, print_json, print_page, progress
 from jaxcal.report.paragraphs import simple_table
 from jaxcal.runtime import jax_cache, program_cache
 from jaxcal.runtime.messages import counted

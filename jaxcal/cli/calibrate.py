@@ -55,12 +55,7 @@ def _one_recording(
 
 @click.command(short_help="Calibrate from a recording: transform, verdict, report.")
 @click.argument(
-    "recording",
-    type=click.Path(),
-    nargs=-1,
-    required=True,
-    callback=_one_recording,
-    metavar="REC",
+    "recording", type=click.Path(), nargs=-1, required=True, callback=_one_recording, metavar="REC"
 )
 @click.option(
     "--method",

@@ -8,12 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from jaxcal.cli.common import (
-    ExitCode,
-    json_option,
-    print_json,
-    print_page,
-)
+from jaxcal.cli.common import ExitCode, json_option, print_json, print_page
 from jaxcal.report.paragraphs import Verbatim, simple_table
 from jaxcal.runtime.messages import counted
 

@@ -153,10 +153,7 @@ def export(
 
 
 def check_configuration(
-    path: str,
-    out: str | None,
-    inputs: Sequence[str],
-    frames: tuple[str, str],
+    path: str, out: str | None, inputs: Sequence[str], frames: tuple[str, str]
 ) -> None:
     """Check that a transform can be put into a configuration of PLUS, in place or in a copy.
 

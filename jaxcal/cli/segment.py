@@ -20,14 +20,7 @@ from jaxcal.cli.common import (
     print_page,
     progress,
 )
-from jaxcal.cli.sequence_options import (
-    SEARCH,
-    TABLES,
-    TRACKING,
-    beside,
-    by_hand,
-    with_options,
-)
+from jaxcal.cli.sequence_options import SEARCH, TABLES, TRACKING, beside, by_hand, with_options
 from jaxcal.data.names import NoiseScale, SegmentationMethod
 from jaxcal.runtime.messages import counted
 
@@ -74,10 +67,7 @@ if TYPE_CHECKING:
     help="Temperature of the water, which sets the sound speed.",
 )
 @click.option(
-    "--out",
-    type=click.Path(),
-    metavar="OUT.h5",
-    help="By default REC-segmented.h5, beside REC.",
+    "--out", type=click.Path(), metavar="OUT.h5", help="By default REC-segmented.h5, beside REC."
 )
 @with_options(TRACKING)
 @with_options(SEARCH)

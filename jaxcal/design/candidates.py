@@ -287,9 +287,7 @@ def candidates_around(
 
 
 def seen_region(
-    recording: Recording,
-    targets: Float[np.ndarray, "n 3"],
-    transform: ImageTransform | None = None,
+    recording: Recording, targets: Float[np.ndarray, "n 3"], transform: ImageTransform | None = None
 ) -> Region:
     """Where the target was, slightly enlarged; at least most of the face of a known probe.
 

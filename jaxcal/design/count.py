@@ -21,9 +21,7 @@ _ENOUGH = 1000
 
 
 def images_to(
-    result: Calibration | Plan,
-    tre_mm: float,
-    candidates: Candidates | None = None,
+    result: Calibration | Plan, tre_mm: float, candidates: Candidates | None = None
 ) -> int:
     """How many more images are needed for a wanted target registration error.
 

@@ -9,22 +9,8 @@ import numpy as np
 from jaxcal import InputError
 from jaxcal.data.recording import MINIMUM_IMAGES
 from jaxcal.design.candidates import Candidates
-from jaxcal.design.criteria import (
-    check_criterion,
-    curve,
-    hypotheses,
-    tre_weight,
-    weight_of,
-)
-from jaxcal.design.greedy import (
-    MOST_POSES,
-    Cover,
-    Rules,
-    Search,
-    choose,
-    exchange,
-    space_features,
-)
+from jaxcal.design.criteria import check_criterion, curve, hypotheses, tre_weight, weight_of
+from jaxcal.design.greedy import MOST_POSES, Cover, Rules, Search, choose, exchange, space_features
 from jaxcal.design.information import (
     Known,
     Model,

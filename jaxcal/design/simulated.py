@@ -151,10 +151,7 @@ def _with_taken(plan: Plan) -> Float[np.ndarray, "n 4 4"]:
 
 
 def _recordings(
-    poses: Float[np.ndarray, "trials n 4 4"],
-    model: Model,
-    law: LawName,
-    rng: np.random.Generator,
+    poses: Float[np.ndarray, "trials n 4 4"], model: Model, law: LawName, rng: np.random.Generator
 ) -> Problem:
     """Problems whose poses are off along the elevational axis, with erring measurements."""
     import jax

@@ -283,10 +283,7 @@ def _precision(result: Calibration, images: Images) -> float | None:
     if images.mask.sum() < 2:
         return None
     value = reconstruction_precision(
-        np.asarray(result.image_to_probe),
-        images.poses,
-        _points_mm(images, result),
-        images.mask,
+        np.asarray(result.image_to_probe), images.poses, _points_mm(images, result), images.mask
     )
     return float(value)
 

@@ -196,11 +196,7 @@ class Panel:
         return ticks(*self.y, most)
 
     def axes(
-        self,
-        x_label: str = "",
-        y_label: str = "",
-        *,
-        x_ticks: tuple[Number, Number] | None = None,
+        self, x_label: str = "", y_label: str = "", *, x_ticks: tuple[Number, Number] | None = None
     ) -> list[str]:
         """Grid, ticks and labels; without an x label the numbers of x are left out, too.
 

@@ -24,15 +24,7 @@ from jaxcal.result.calibration import Calibration
 from jaxcal.result.saved import is_calibration_record
 from jaxcal.runtime.array_types import Int
 
-TEST_COLUMNS = (
-    "image",
-    "used",
-    "lateral_mm",
-    "elevational_mm",
-    "axial_mm",
-    "distance_mm",
-    "frame",
-)
+TEST_COLUMNS = ("image", "used", "lateral_mm", "elevational_mm", "axial_mm", "distance_mm", "frame")
 """Columns of test_residuals.csv: from the point of each test image to the mean of all of them."""
 
 COLUMNS = (

@@ -49,10 +49,7 @@ def open_results(folder: str | os.PathLike[str], *, incomplete: bool = False) ->
     spec, values = store.spec, read_all(store, incomplete=incomplete)
     lengths = [len(spec.axis(name)) for name in spec.listed]
     dimensions: dict[str, tuple[str, ...]] = dict.fromkeys(UNITS, ("method", "trial"))
-    dimensions |= {
-        "sigma": ("method", "trial", "component"),
-        "realised": ("trial", "component"),
-    }
+    dimensions |= {"sigma": ("method", "trial", "component"), "realised": ("trial", "component")}
     variables: dict[str, Any] = {}
     for name, array in values.items():
         shaped = array.reshape(*lengths, *array.shape[1:])
