@@ -44,6 +44,17 @@ _BEYOND = (
     "Beyond these, vary all tilts and where the target is in the image: near and far, left and "
     "right."
 )
+_STEPS = {
+    "failed": "Check that poses and images belong together, that poses are probe -> tracker, and "
+    "that lengths are in mm.",
+    "max_iterations": "Leave out images in which the target was picked wrongly (they have the "
+    "largest residuals), or add images; then calibrate again.",
+    "targets": "Import the points of one of the two targets alone, or calibrate with --robust, "
+    "which leaves the images of the other one out if they are few.",
+    "origins": "Look at the images that are named, and correct their points or leave them out; "
+    "--robust leaves them out if they are few.",
+}
+"""What to do, by the status, or by the kind of an error that the model leaves out."""
 _KINDS = {
     "lateral": "lateral errors of the points",
     "range": "range errors of the points",
@@ -424,56 +435,48 @@ def _out_of_plane(record: dict[str, Any]) -> bool:
 
 def advice(record: dict[str, Any]) -> list[str]:
     """What to do, as sentences."""
-    status, few = record["status"], record["images_used"] < ENOUGH_IMAGES
-    advice: list[str] = []
     if record.get("wrong_frames"):
-        return advice
+        return []
     # First what may be wrong with the images that there are.
-    if record["outliers"]:
-        listed = ", ".join(map(str, record["outliers"][:10]))
-        more = ", ..." if len(record["outliers"]) > 10 else ""
-        one = len(record["outliers"]) == 1
-        images = f"image{'s' * (not one)} {listed}{more} (counted from 0)"
-        them = "it" if one else "them"
-        advice.append(
-            f"Check {images}, which {'was' if one else 'were'} left out, and pick the target in "
-            f"{them} again."
-            if record.get("robust")
-            else f"Check {images} and pick the target in {them} again, or calibrate with --robust, "
-            f"which leaves {them} out."
-        )
-    if status == "failed":
-        advice.append(
-            "Check that poses and images belong together, that poses are probe -> tracker, and "
-            "that lengths are in mm."
-        )
-    elif status == "unobservable":
-        advice.append(_addition(record))
-    elif status == "max_iterations":
-        advice.append(
-            "Leave out images in which the target was picked wrongly (they have the largest "
-            "residuals), or add images; then calibrate again."
-        )
-    elif _unmodelled(record).get("kind") == "targets":
-        advice.append(
-            "Import the points of one of the two targets alone, or calibrate with --robust, which "
-            "leaves the images of the other one out if they are few."
-        )
-    elif _unmodelled(record).get("kind") == "origins":
-        advice.append(
-            "Look at the images that are named, and correct their points or leave them out; "
-            "--robust leaves them out if they are few."
-        )
-    elif (record.get("tre") or {}).get("contradictions"):
-        advice.append(
-            "First see to what contradicts the noise model, which is said above; add images after "
-            "that."
-        )
-    elif not record.get("doubtful_unit") and (few or record["verdict"] == "uncertain"):
-        advice.append(_addition(record))
-    if status == "converged" and record["method"] == "conventional" and _out_of_plane(record):
-        advice.append(
+    found = [_check_outliers(record), _next_step(record)]
+    converged = record["status"] == "converged"
+    if converged and record["method"] == "conventional" and _out_of_plane(record):
+        found.append(
             "Most of the error is out of the image plane, where the conventional method assumes "
             "none: try --method joint."
         )
-    return advice
+    return [text for text in found if text is not None]
+
+
+def _check_outliers(record: dict[str, Any]) -> str | None:
+    """What to do about images that do not fit the rest."""
+    outliers = record["outliers"]
+    if not outliers:
+        return None
+    plural, was, them = ("", "was", "it") if len(outliers) == 1 else ("s", "were", "them")
+    more = ", ..." if len(outliers) > 10 else ""
+    images = f"image{plural} {', '.join(map(str, outliers[:10]))}{more} (counted from 0)"
+    if record.get("robust"):
+        return f"Check {images}, which {was} left out, and pick the target in {them} again."
+    return (
+        f"Check {images} and pick the target in {them} again, or calibrate with --robust, which "
+        f"leaves {them} out."
+    )
+
+
+def _next_step(record: dict[str, Any]) -> str | None:
+    """What to do before anything else, by how the solve ended and what looks wrong."""
+    status, kind = record["status"], _unmodelled(record).get("kind")
+    if status == "unobservable":
+        return _addition(record)
+    if (step := _STEPS.get(status) or _STEPS.get(kind)) is not None:
+        return step
+    if (record.get("tre") or {}).get("contradictions"):
+        return (
+            "First see to what contradicts the noise model, which is said above; add images after "
+            "that."
+        )
+    few = record["images_used"] < ENOUGH_IMAGES
+    if not record.get("doubtful_unit") and (few or record["verdict"] == "uncertain"):
+        return _addition(record)
+    return None
