@@ -417,7 +417,8 @@ def _with_arrays(data: Any, values: dict[str, np.ndarray]) -> Any:
 
 def _alike_for(problem: Problem, estimate: tuple[str, ...]) -> float:
     """For how many images of a stream the errors stay alike; 1 for other recordings."""
-    if not _moves_continuously(np.asarray(problem.poses, float)[np.asarray(problem.mask) > 0]):
+    poses = np.asarray(problem.poses, float)[np.asarray(problem.mask) > 0]
+    if step_share(poses) >= CONTINUOUS_SHARE:
         # Errors that are alike for long are then no stream's: a mount has slipped, say.
         return 1.0
     errors = _conventional_errors(problem, estimate)
@@ -429,11 +430,6 @@ def _alike_for(problem: Problem, estimate: tuple[str, ...]) -> float:
         # of the few that were kept, a fit would show nothing.
         return 1.0
     return time
-
-
-def _moves_continuously(poses: Float[np.ndarray, "n 4 4"]) -> bool:
-    """Whether successive poses are much closer to each other than any two poses are."""
-    return step_share(poses) < CONTINUOUS_SHARE
 
 
 def step_share(poses: Float[np.ndarray, "n 4 4"]) -> float:

@@ -26,7 +26,7 @@ from jaxcal.diagnostics.image_errors import motion
 from jaxcal.model.unknowns import RIGID, TABLE, block_slice, count_unknowns
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Float
-from jaxcal.runtime.arrays import is_traced
+from jaxcal.runtime.arrays import array_tree, is_traced, static
 from jaxcal.runtime.given_values import check_flag, check_made, is_number, real_array
 
 BELIEVED_SD = {"translation": 50.0, "rotation": 0.5, "point": 50.0, "scale": 0.3}
@@ -53,22 +53,22 @@ class Known:
     tuned: bool = False
 
 
-@dataclass(frozen=True, eq=False)
+@array_tree
 class Model:
-    """Everything that the Jacobian of a pose depends on, except the pose.
+    """Everything that the Jacobian of a pose depends on, except the pose (a tree of arrays).
 
     Attributes:
         image_to_probe: X as far as it is known, mm.
         point: the target in the tracker's frame, mm.
         noise: SDs.
-        scale: whether the two pixel scales are unknown, too.
+        scale: whether the two pixel scales are unknown, too (static).
         face_offset_mm: range of pixel row 0, which pixel scales do not stretch.
     """
 
     image_to_probe: Float[Any, "4 4"] = field(default_factory=lambda: np.eye(4))
     point: Float[Any, " 3"] = field(default_factory=lambda: np.zeros(3))
     noise: Noise = field(default_factory=lambda: Noise.constant((0.5, 0.3, 1.0)))
-    scale: bool = False
+    scale: bool = static(default=False)
     face_offset_mm: float = 0.0
 
     def __post_init__(self) -> None:

@@ -9,7 +9,7 @@ target's distance from the mid-plane.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from jaxcal.diagnostics.image_errors import error_sd
 from jaxcal.diagnostics.sd_by_place import basis_at, log_sd_slopes
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Bool, Float
-from jaxcal.runtime.arrays import is_traced
+from jaxcal.runtime.arrays import array_tree, is_traced
 from jaxcal.runtime.given_values import check_made, is_number, real_array
 
 FEWEST_TO_LEARN = 20
@@ -41,7 +41,7 @@ def check_result(result: object) -> None:
         raise InputError("poses are planned for one problem; the result is of a batch")
 
 
-@dataclass(frozen=True, eq=False)
+@array_tree
 class Noise:
     """SDs of lateral position, range and elevational offset by the target's place in the image.
 

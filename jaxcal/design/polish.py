@@ -20,7 +20,6 @@ from jaxcal.design.candidates import Candidates
 from jaxcal.design.constraints import Region
 from jaxcal.design.greedy import Chosen, Search, are_alike
 from jaxcal.design.information import Model, covariance_of
-from jaxcal.design.noise import Noise
 from jaxcal.runtime.jax_modes import in_own_modes
 
 _STEPS = 8
@@ -46,26 +45,23 @@ def pose_of(
     return matrix_from_rotation(rotation, point - rotation @ place)
 
 
-@partial(jax.jit, static_argnames=("region", "scale", "face_offset_mm"))
+@partial(jax.jit, static_argnames="region")
 def _scored(
-    numbers,
-    known,
-    weight,
-    factors,
-    reference,
-    x,
-    point,
-    coefficients,
+    numbers: Float[Array, " 5"],
+    known: Float[Array, "k p p"],
+    weight: Float[Array, "p p"] | None,
+    factors: Float[Array, "k 3"],
+    reference: Float[Array, "3 3"],
+    model: Model,
     *,
-    region,
-    scale,
-    face_offset_mm,
-):
+    region: Region,
+) -> tuple[Float[Array, ""], Float[Array, " 5"]]:
     """The score of a pose as in :func:`jaxcal.design.criteria.gains`, and its gradient."""
 
     def score(numbers: Float[Array, " 5"]) -> Float[Array, ""]:
-        pose = pose_of(numbers, reference, x, point, region)
-        rows = Model(x, point, Noise(coefficients), scale, face_offset_mm).jacobian(pose)
+        rows = model.jacobian(
+            pose_of(numbers, reference, model.image_to_probe, model.point, region)
+        )
 
         def one(covariance: Float[Array, "p p"], factor: Float[Array, " 3"]) -> Float[Array, ""]:
             own = rows / factor[:, None]
@@ -98,7 +94,7 @@ def polish(search: Search, candidates: Candidates, chosen: Chosen) -> Float[np.n
     Those that fill space stay, and so do a caller's own that are outside the constraints.
     """
     model, bounds = candidates.model, candidates.constraints
-    x, point = np.asarray(model.image_to_probe), np.asarray(model.point)
+    x, point = model.image_to_probe, model.point
     poses = candidates.poses[chosen.rows].copy()
     numbers = candidates.numbers[chosen.rows]
     rotations = search.rotations[chosen.rows].copy()
@@ -106,30 +102,18 @@ def polish(search: Search, candidates: Candidates, chosen: Chosen) -> Float[np.n
     information = chosen.information.copy()
     # In units of the extent, of which none is zero.
     scale = np.maximum(bounds.extent, np.radians(1e-3))
+    given = (search.weight, search.factors, bounds.reference, model)
 
     def evaluate(at: np.ndarray, known: np.ndarray) -> tuple[float, np.ndarray]:
-        value, slope = _scored(
-            at,
-            known,
-            search.weight,
-            search.factors,
-            bounds.reference,
-            x,
-            point,
-            np.asarray(model.noise.coefficients),
-            region=bounds.region,
-            scale=model.scale,
-            face_offset_mm=model.face_offset_mm,
-        )
+        value, slope = _scored(at, known, *given, region=bounds.region)
         return float(value), np.asarray(slope)
 
     def among_too_many(k: int, pose: np.ndarray) -> bool:
-        turn, place = (pose[:3, :3] @ x[:3, :3]).reshape(1, 9), model.targets(pose)[None]
         others = np.arange(len(poses)) != k
-        near = are_alike(rotations[others], places[others], turn, place, search.rules).sum()
-        near += are_alike(
-            search.taken_rotations, search.taken_places, turn, place, search.rules
-        ).sum()
+        turns = np.concatenate([rotations[others], search.taken_rotations])
+        seen = np.concatenate([places[others], search.taken_places])
+        turn, place = (pose[:3, :3] @ x[:3, :3]).reshape(1, 9), model.targets(pose)[None]
+        near = are_alike(turns, seen, turn, place, search.rules).sum()
         return bool(near >= search.rules.replicates)
 
     def better_step(

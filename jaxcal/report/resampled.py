@@ -10,7 +10,7 @@ import numpy as np
 from jaxcal.diagnostics.residual_checks import FEWEST_TO_CHECK
 from jaxcal.report.accuracy import stated_at
 from jaxcal.result.calibration import Calibration
-from jaxcal.runtime.arrays import plain
+from jaxcal.runtime.arrays import map_arrays, plain
 
 if TYPE_CHECKING:
     from jaxcal.calibration.resampling import Bootstrap, CrossValidation
@@ -18,36 +18,36 @@ if TYPE_CHECKING:
 
 def cross_validation_record(found: CrossValidation, result: Calibration) -> dict[str, Any]:
     """Cross-validation as plain values; ``result`` is the calibration of all images."""
-    influence = np.asarray(found.influence, dtype=float)
-    used = np.asarray(found.mask) > 0
+    found = map_arrays(np.asarray, found)
+    used = found.mask > 0
     return plain(
         {
-            "folds": len(np.asarray(found.converged)),
-            "folds_converged": int(np.asarray(found.converged).sum()),
-            "precision_mm": float(found.precision),
-            "rms_mm": float(found.rms),
-            "log_density": float(np.sum(np.asarray(found.log_density))),
-            "influence": np.where(used, influence, np.nan),
-            "image_moved_mm": np.where(used, np.asarray(found.image_moved), np.nan),
-            "image_points_mm": np.asarray(found.image_points),
-            "stated_mm": stated_at(result, np.asarray(found.image_points)),
+            "folds": len(found.converged),
+            "folds_converged": found.converged.sum(),
+            "precision_mm": found.precision,
+            "rms_mm": found.rms,
+            "log_density": np.sum(found.log_density),
+            "influence": np.where(used, found.influence, np.nan),
+            "image_moved_mm": np.where(used, found.image_moved, np.nan),
+            "image_points_mm": found.image_points,
+            "stated_mm": stated_at(result, found.image_points),
         }
     )
 
 
 def bootstrap_record(found: Bootstrap, result: Calibration) -> dict[str, Any]:
     """The bootstrap as plain values; ``result`` is the calibration of all images."""
-    spread = np.asarray(found.spread, dtype=float)
+    found = map_arrays(np.asarray, found)
     return plain(
         {
-            "resamples": len(np.asarray(found.converged)),
-            "resamples_converged": int(np.asarray(found.converged).sum()),
-            "translation_sd_mm": spread[:3],
-            "rotation_sd_deg": np.degrees(spread[3:]),
-            "image_points_mm": np.asarray(found.image_points),
-            "reproducibility_mm": np.asarray(found.reproducibility),
-            "rms_scatter_mm": np.asarray(found.rms_scatter),
-            "stated_mm": stated_at(result, np.asarray(found.image_points)),
+            "resamples": len(found.converged),
+            "resamples_converged": found.converged.sum(),
+            "translation_sd_mm": found.spread[:3],
+            "rotation_sd_deg": np.degrees(found.spread[3:]),
+            "image_points_mm": found.image_points,
+            "reproducibility_mm": found.reproducibility,
+            "rms_scatter_mm": found.rms_scatter,
+            "stated_mm": stated_at(result, found.image_points),
         }
     )
 

@@ -141,19 +141,13 @@ def bound_mm(method: MethodSpec, condition: Condition) -> float:
 
 def protocol(condition: Condition, probe: LinearProbe) -> Protocol:
     """The distributions of one condition."""
+    given = dict(vars(condition))
     return Protocol(
-        images=condition.images,
-        test_images=condition.test_images,
-        elevation_mm=condition.elevation_mm,
-        elevation_distribution=condition.elevation_distribution,
-        noise_mm=condition.noise_mm,
-        lateral_mm=condition.lateral_mm,
-        depth_mm=(condition.depth_min_mm, condition.depth_max_mm),
-        rotation_rad=float(np.radians(condition.rotation_deg)),
-        test_fraction=condition.test_fraction,
+        depth_mm=(given.pop("depth_min_mm"), given.pop("depth_max_mm")),
+        rotation_rad=float(np.radians(given.pop("rotation_deg"))),
+        tracker_rad=float(np.radians(given.pop("tracker_deg"))),
         probe=probe,
-        tracker_mm=condition.tracker_mm,
-        tracker_rad=float(np.radians(condition.tracker_deg)),
+        **given,
     )
 
 
