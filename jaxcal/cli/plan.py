@@ -145,16 +145,12 @@ def plan(
     until_tre: float | None,
     criterion: Criterion,
     probe: ProbeKind | None,
-    depth: tuple[float, float] | None,
-    lateral: float | None,
-    cone: float | None,
-    turn: float | None,
     sigma: tuple[float, float, float] | None,
     estimate: str | None,
-    seed: int,
     simulate: tuple[LawName, ...],
     figure: str | None,
     as_json: bool,
+    **candidate: Any,  # depth, lateral, cone, turn, seed
 ) -> int:
     """Plan which poses to take images from, and how many are needed for a given error.
 
@@ -169,7 +165,7 @@ def plan(
     if recording is not None and sigma is not None:
         raise InputError("--sigma cannot be used with a recording: its images determine the SDs")
     for name, largest, least in (
-        ("--lateral", lateral, _LEAST_LATERAL_MM),
+        ("--lateral", candidate["lateral"], _LEAST_LATERAL_MM),
         ("--sigma", sigma and max(sigma), _LEAST_SIGMA_MM),
     ):
         if largest is not None and largest < least:
@@ -185,11 +181,9 @@ def plan(
         check_output(figure, "a picture", begins_with(*_PICTURES), [recording] if recording else ())
     result, found_wrong = None, {}
     if recording is None:
-        candidates = _from_nothing(probe or "linear", depth, lateral, cone, turn, sigma, seed)
+        candidates = _from_nothing(probe or "linear", sigma, **candidate)
     else:
-        result, candidates, found_wrong = _from_recording(
-            recording, estimate, probe, depth, lateral, cone, turn, seed
-        )
+        result, candidates, found_wrong = _from_recording(recording, estimate, probe, **candidate)
     with progress("planning"):
         if until_tre is None:
             count = images or (30 if result is None else 10)
@@ -202,7 +196,7 @@ def plan(
     if simulate:
         with progress("calibrating simulated recordings"):
             record["simulated"] = [
-                asdict(design.simulate_errors(found, law, candidates, seed=seed))
+                asdict(design.simulate_errors(found, law, candidates, seed=candidate["seed"]))
                 for law in simulate
             ]
     if as_json:
@@ -242,11 +236,11 @@ def _columns(
 
 def _from_nothing(
     probe: ProbeKind,
+    sigma: tuple[float, float, float] | None,
     depth: tuple[float, float] | None,
     lateral: float | None,
     cone: float | None,
     turn: float | None,
-    sigma: tuple[float, float, float] | None,
     seed: int,
 ) -> Candidates:
     from jaxcal import design

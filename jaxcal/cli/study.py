@@ -119,6 +119,22 @@ _LINE_EVERY_S = 60.0
 """Time between two lines of progress where nobody watches."""
 
 
+class _Lines:
+    """A line a minute, for the log of a batch job."""
+
+    def begin(self, trials: int, done: int) -> None:
+        self._trials, self._done, self._told = trials, done, time.monotonic()
+
+    def advance(self, trials: int) -> None:
+        self._done += trials
+        if time.monotonic() - self._told >= _LINE_EVERY_S:
+            self._told = time.monotonic()
+            click.echo(f"{self._done} of {self._trials} trials done", err=True)
+
+    def note(self, message: str) -> None:
+        click.echo(f"jaxcal: note: {message}", err=True)
+
+
 class _Bar:
     """Trials done, trials a second and time left, on standard error."""
 
@@ -143,24 +159,7 @@ class _Bar:
 @contextmanager
 def _watching() -> Iterator[Watcher]:
     if sys.stderr is None or not sys.stderr.isatty():
-        from jaxcal.study.run import Silence
-
-        class Lines(Silence):
-            """A line a minute, for the log of a batch job."""
-
-            def begin(self, trials: int, done: int) -> None:
-                self._trials, self._done, self._told = trials, done, time.monotonic()
-
-            def advance(self, trials: int) -> None:
-                self._done += trials
-                if time.monotonic() - self._told >= _LINE_EVERY_S:
-                    self._told = time.monotonic()
-                    click.echo(f"{self._done} of {self._trials} trials done", err=True)
-
-            def note(self, message: str) -> None:
-                click.echo(f"jaxcal: note: {message}", err=True)
-
-        yield Lines()
+        yield _Lines()
         return
     from rich.console import Console
     from rich.progress import (

@@ -37,7 +37,7 @@ from jaxcal.report.contradictions import contradictions
 from jaxcal.report.thresholds import FAIR_MM, GOOD_MM, WIDEST
 from jaxcal.result.calibration import Calibration
 from jaxcal.result.saved import ASKED_FOR
-from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.array_types import AnyArray, Float
 from jaxcal.runtime.given_values import real_array
 from jaxcal.solvers.closed_form.single import in_closed_form, solve_problem
 
@@ -318,7 +318,7 @@ def settle(record: dict[str, Any]) -> None:
         )
 
 
-def stated_at(result: Calibration, points: Float[np.ndarray, "m 2"]) -> float | None:
+def stated_at(result: Calibration, points: Float[AnyArray, "m 2"]) -> float | None:
     """The error that the covariance states, as root mean square over some image points, mm."""
     found = np.asarray(predicted_tre(result.numpy(), np.asarray(points, float)))
     value = float(np.sqrt(np.mean(found**2)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -28,30 +29,26 @@ def certificate_record(result: Calibration) -> dict[str, Any]:
     Args:
         result: of one problem, with this problem.
     """
-    nothing: dict[str, Any] = {"certified": None, "gap_mm2": None}
     assert result.problem is not None
     problem = replace(result.problem, mask=result.mask)
     estimate = tuple(name for name in FURTHER if name in result.blocks)
-    own = result.method == "conventional"
-    if not (estimate in ((), ("scale",)) or own):
-        return nothing
-    try:
-        found = _of_answer(result, problem, estimate) if own else solve_problem(problem, estimate)
-    except InputError:
-        return nothing
-    return {"certified": found.certified, "gap_mm2": found.gap_mm2}
+    found = None
+    with suppress(InputError):
+        if result.method == "conventional":
+            found = _of_answer(result, problem, estimate)
+        elif estimate in ((), ("scale",)):
+            found = solve_problem(problem, estimate)
+    return {name: getattr(found, name, None) for name in ("certified", "gap_mm2")}
 
 
 def _of_answer(result: Calibration, problem: Problem, estimate: tuple[str, ...]) -> Certificate:
-    factor, scale, speed = 1.0, result.scale_mm_per_px, result.medium.sound_speed_m_s
-    if speed is not None:
-        factor = float(speed / problem.nominal_sound_speed)
+    scale, speed = result.scale_mm_per_px, result.medium.sound_speed_m_s
     return certify(
         problem,
         np.asarray(result.image_to_probe, dtype=float),
         np.asarray(result.point, dtype=float),
         scale_mm_per_px=None if scale is None else np.asarray(scale, dtype=float),
-        sound_speed_factor=factor,
+        sound_speed_factor=1.0 if speed is None else float(speed / problem.nominal_sound_speed),
         estimate=estimate,
     )
 

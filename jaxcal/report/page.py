@@ -451,11 +451,7 @@ def _residuals(record: dict[str, Any], answer: Calibration) -> str:
     first = svg.series(
         [
             (f"{name} (mm)", used, residual[:, axis], colour)
-            for name, axis, colour in (
-                ("lateral", 0, BLUE),
-                ("axial", 2, GREEN),
-                ("elevational", 1, ORANGE),
-            )
+            for name, axis, colour in svg.DIRECTIONS
         ],
         named,
         "Residual of every image: the target less the point that was measured, mm",
@@ -516,13 +512,9 @@ def _limits(record: dict[str, Any]) -> str:
         shares = [(word, found[name][kind], colour) for kind, word, colour in _KINDS]
         if all(share is not None for _, share, _ in shares):
             rows.append((title, [(word, float(share), colour) for word, share, colour in shares]))
+    kinds = {"lateral": "lateral", "range": "range", "out of the plane": "elevation"}
     sds = ", ".join(
-        f"{word} {_length(record, f'sigma_{name}_mm', 'mm')}"
-        for word, name in (
-            ("lateral", "lateral"),
-            ("range", "range"),
-            ("out of the plane", "elevation"),
-        )
+        f"{word} {_length(record, f'sigma_{name}_mm', 'mm')}" for word, name in kinds.items()
     )
     drawn = svg.stacked(rows, "Where the errors come from, in shares of mean squares")
     return _section(

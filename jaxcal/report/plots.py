@@ -25,7 +25,7 @@ from jaxcal.model.image_points import mean_of_squares
 from jaxcal.report.accuracy import error_shares, region_of, scatter_shares
 from jaxcal.report.convergence import Curve
 from jaxcal.report.in_memory import recording_of
-from jaxcal.report.svg import bar_length, drawn, ink, spread_out
+from jaxcal.report.svg import DIRECTIONS, bar_length, drawn, ink, spread_out
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.colours import BLUE, GREEN, GREY, ORANGE
@@ -38,8 +38,6 @@ _ROUNDING = 3e-14
 """An excess of the objective below this relative size is only rounding."""
 _ALONG_A_SIDE = 61
 """Points along each side of the map of the error."""
-COLOURS = {"lateral": BLUE, "axial": GREEN, "elevational": ORANGE}
-"""Colours of the directions in the image; an error of the range is an axial one."""
 
 
 def canvas(width_mm: float, height_mm: float) -> Figure:
@@ -111,12 +109,10 @@ def plot_residuals(calibration: Calibration) -> Figure:
     named = np.intersect1d([*outliers(answer), *suspected], used)
     figure = canvas(PAGE_MM, 110.0)
     panels = figure.subplots(3, 1, sharex=True, sharey=True)
-    for panel, (name, axis) in zip(
-        panels, (("lateral", 0), ("axial", 2), ("elevational", 1)), strict=True
-    ):
+    for panel, (name, axis, colour) in zip(panels, DIRECTIONS, strict=True):
         styled(panel)
         panel.axhline(0.0, color=GREY, linewidth=0.5)
-        values, colour = residual[:, axis], COLOURS[name]
+        values = residual[:, axis]
         shown = used[drawn(values[used], np.searchsorted(used, named))]
         panel.vlines(shown, 0.0, values[shown], color=colour, linewidth=0.7)
         panel.plot(shown, values[shown], "o", color=colour, ms=2.2)
@@ -227,12 +223,11 @@ def plot_limits(calibration: Calibration) -> Figure:
     rows = ("residual of\nthe target", "error of the calibration\nin the image")
     for row, values in enumerate((scatter_shares(answer), shares)):
         left = 0.0
-        for name, share in zip(COLOURS, values, strict=True):
-            bar = panel.barh(
-                row, share, left=left, color=COLOURS[name], height=0.6, label=name if row else None
-            )
+        for (name, _, colour), share in zip(DIRECTIONS, values, strict=True):
+            label = name if row else None
+            bar = panel.barh(row, share, left=left, color=colour, height=0.6, label=label)
             told = f"{100 * share:.0f} %" if share > 0.05 else ""
-            panel.bar_label(bar, [told], label_type="center", color=ink(COLOURS[name]), fontsize=7)
+            panel.bar_label(bar, [told], label_type="center", color=ink(colour), fontsize=7)
             left += share
     panel.set_yticks([0, 1], rows)
     panel.set(xlim=(0, 1), xlabel="share of the mean square")

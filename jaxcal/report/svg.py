@@ -15,10 +15,12 @@ from typing import Any
 import numpy as np
 
 from jaxcal.runtime.array_types import Float, Int
-from jaxcal.runtime.colours import BLUE, ORANGE
+from jaxcal.runtime.colours import BLUE, GREEN, ORANGE
 
 Number = float | int | np.floating
 
+DIRECTIONS = (("lateral", 0, BLUE), ("axial", 2, GREEN), ("elevational", 1, ORANGE))
+"""Directions in the image: name, axis of the image frame, and colour. Range errors are axial."""
 WIDTH = 380.0
 MOST_DRAWN = 2000
 """Most images of one curve: more than three for each unit of a figure's width."""

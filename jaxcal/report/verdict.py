@@ -469,7 +469,7 @@ def _next_step(record: dict[str, Any]) -> str | None:
     status, kind = record["status"], _unmodelled(record).get("kind")
     if status == "unobservable":
         return _addition(record)
-    if (step := _STEPS.get(status) or _STEPS.get(kind)) is not None:
+    if (step := _STEPS.get(status) or _STEPS.get(kind or "")) is not None:
         return step
     if (record.get("tre") or {}).get("contradictions"):
         return (
