@@ -339,7 +339,7 @@ def test_poses_that_are_alike_are_counted_once_for_each_image_in_use():
     alike = (np.degrees(angles) < rules.apart_deg) & (apart < rules.apart_mm)
     assert alike.sum() > 100
     np.testing.assert_array_equal(search.counts([3, 7]), alike.sum(axis=1))
-    alone = search.alike(search.rotations[3], search.places[3])
+    alone = search.alike(3)
     np.testing.assert_array_equal(search.counts([3]) - search.counts([]), alone)
 
 

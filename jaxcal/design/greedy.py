@@ -109,11 +109,10 @@ class Search:
             total = total + gains(rows[chosen], covariance, self.weight)
         return np.asarray(total) / len(self.rows)
 
-    def alike(
-        self, rotation: Float[np.ndarray, " 9"], place: Float[np.ndarray, " 3"]
-    ) -> Bool[np.ndarray, " m"]:
-        """Which candidates are replicates of a pose."""
-        return are_alike(self.rotations, self.places, rotation[None], place[None], self.rules)[:, 0]
+    def alike(self, row: int) -> Bool[np.ndarray, " m"]:
+        """Which candidates are replicates of one of them."""
+        turn, place = self.rotations[[row]], self.places[[row]]
+        return are_alike(self.rotations, self.places, turn, place, self.rules)[:, 0]
 
     def counts(self, rows: Sequence[int]) -> Float[np.ndarray, " m"]:
         """For each candidate, how many poses are alike: images taken already and these rows."""
@@ -238,7 +237,7 @@ def choose(
         value = value if cost_s is None else value / cost_s
         row = int(np.argmax(np.where(open_to, value, -np.inf)))
         information = information + search.information_of(row)
-        alike += search.alike(search.rotations[row], search.places[row])
+        alike += search.alike(row)
         if cover is not None:
             cover.add(row)
         free[row] = False
@@ -263,7 +262,7 @@ def exchange(search: Search, chosen: Chosen) -> Chosen:
                 continue
             without = information - search.information_of(row)
             value = search.scores(without, shortlist)
-            own = search.alike(search.rotations[row], search.places[row])
+            own = search.alike(row)
             open_to = (counts - own)[shortlist] < search.rules.replicates
             open_to[[place[other] for other in rows]] = False
             open_to[place[row]] = True
@@ -272,7 +271,7 @@ def exchange(search: Search, chosen: Chosen) -> Chosen:
                 continue
             rows[k], moved = best, True
             information = without + search.information_of(best)
-            counts += search.alike(search.rotations[best], search.places[best]) - own.astype(float)
+            counts += search.alike(best) - own.astype(float)
         if not moved:
             break
     return Chosen(rows, list(chosen.filling), information)

@@ -1,28 +1,7 @@
 """What contradicts the stated error of a calibration, and how large it makes the error, in words.
 
-The covariance assumes that the noise model holds. It is contradicted if
-
-- the residuals are larger than a beam is thick (10 mm);
-- images of exactly one pose were counted as independent, as in a batch;
-- the residuals make the error larger than their SDs do by more than three SDs of chance;
-- leaving one image out moves image points by more than half the stated error and by more than four
-  times the expected move (by one step from the normal equations, or by cross-validation if this was
-  requested);
-- the scatter in cross-validation or bootstrap is more than 1.3 times the stated error, and by more
-  than the chance of a scatter that is known from so many images (with few images, calibrations of
-  fewer are other estimates, and are not compared);
-- test images scatter far more than the calibration explains, also without a few of them that do not
-  fit the others;
-- the errors within the image drift, come in two groups, or would be explained by an error that the
-  model leaves out (:mod:`jaxcal.diagnostics.unmodelled`);
-- along a slow path the offsets are far smaller than all other errors: those that changed as slowly
-  as the pose have moved the answer instead;
-- many points share the outermost coordinate, as if cut off there
-  (:mod:`jaxcal.diagnostics.clipped`);
-- images that were left out as outliers agree among themselves on another calibration
-  (:mod:`jaxcal.diagnostics.outlier_agreement`);
-- offsets are bounded or uniform, and the fit with Gaussian offsets is far away
-  (:mod:`jaxcal.diagnostics.gaussian_offsets`).
+The covariance assumes that the noise model holds. Each of :data:`_CHECKS` looks for one thing that
+contradicts it, in the record of a calibration.
 """
 
 from __future__ import annotations
@@ -270,7 +249,7 @@ def _from_slow_changes(record: dict[str, Any]) -> Found:
 
 
 def _from_unmodelled(record: dict[str, Any]) -> Found:
-    """An error that the model leaves out, and that the residuals show."""
+    """An error that the model leaves out (:mod:`jaxcal.diagnostics.unmodelled`)."""
     found = record["tre"]["unmodelled"]
     if found is None:
         return
@@ -371,7 +350,10 @@ def _from_groups(record: dict[str, Any]) -> Found:
 
 
 def _from_left_out(record: dict[str, Any]) -> Found:
-    """Images left out that agree among themselves as well as those in use do."""
+    """Images left out as outliers that agree on another calibration.
+
+    :mod:`jaxcal.diagnostics.outlier_agreement` finds them.
+    """
     if (found := record["tre"]["left_out"]) is not None:
         words = (
             f"the {found['images']} images left out agree among themselves, but on a calibration "
@@ -381,7 +363,10 @@ def _from_left_out(record: dict[str, Any]) -> Found:
 
 
 def _from_absorbed_offsets(record: dict[str, Any]) -> Found:
-    """Offsets that the answer has taken up: as large as the other errors, as far as one knows."""
+    """Offsets that are far smaller than all other errors, along a slow path.
+
+    Those that changed as slowly as the pose have moved the answer instead.
+    """
     offsets = record["sigma_elevation_mm"]
     others = [size for kind in _WAYS if (size := record[f"sigma_{kind}_mm"])]
     if record["tre"]["slow_path"] < SLOW or not (offsets and len(others) == 2):
@@ -397,7 +382,7 @@ def _from_absorbed_offsets(record: dict[str, Any]) -> Found:
 
 
 def _from_clipped(record: dict[str, Any]) -> Found:
-    """Points that were cut off at an edge, beyond which the target was in some images."""
+    """Points that were cut off at an edge (:mod:`jaxcal.diagnostics.clipped`)."""
     found, unit = record["tre"]["clipped"], record["tre"]["unit"]
     if found is None:
         return
@@ -412,7 +397,10 @@ def _from_clipped(record: dict[str, Any]) -> Found:
 
 
 def _from_limits(record: dict[str, Any]) -> Found:
-    """An answer that sharp limits of the offsets have moved."""
+    """Sharp limits of the offsets that moved the answer.
+
+    :mod:`jaxcal.diagnostics.gaussian_offsets` has the fit to compare with.
+    """
     found = record["tre"]["gaussian_offsets"]
     if found is None or found["apart_mm"] <= LIMITS_TIMES * found["error_mm"]:
         return
