@@ -315,6 +315,7 @@ for call, *given in (
     (lambda depth: jaxcal.Protocol(depth_mm=depth), 10),
     (lambda depth: jaxcal.Protocol(depth_mm=depth), (-1, 10)),
     (lambda noise: jaxcal.Protocol(noise_mm=noise), "a"),
+    (lambda noise: jaxcal.Protocol(noise_mm=noise), "0.5"),
     (lambda images: jaxcal.Protocol(images=images), 8.5),
     (jaxcal.Problem.from_arrays, poses + 0j, points),
     (jaxcal.Problem.from_arrays, poses, points.tolist()[:-1] + [[1.0]]),

@@ -186,6 +186,10 @@ def _section(title: str, *parts: str) -> str:
     return f"<section><h2>{escape(title)}</h2>{''.join(parts)}</section>"
 
 
+def _figure(drawn: str, caption: str) -> str:
+    return f"<figure>{drawn}<figcaption>{caption}</figcaption></figure>"
+
+
 def _table(rows: Iterable[Sequence[str]], head: Sequence[str] = (), words: int = 1) -> str:
     """A table of HTML; all columns after the first ones, of ``words``, hold numbers."""
 
@@ -271,11 +275,13 @@ def _accuracy(record: dict[str, Any], answer: Calibration, recording: Recording)
         )
     return _section(
         "How accurate",
-        '<div class="grid"><figure>',
-        map_of_error(record, answer, recording),
-        "<figcaption>Distance to expect between the true position of what is seen at a point of "
-        "the image and its position by this calibration. Dots: where the target was."
-        "</figcaption></figure><div>",
+        '<div class="grid">',
+        _figure(
+            map_of_error(record, answer, recording),
+            "Distance to expect between the true position of what is seen at a point of the image "
+            "and its position by this calibration. Dots: where the target was.",
+        ),
+        "<div>",
         _table(rows, head),
         why,
         '<p class="soft">Each interval leaves 2.5 % below and 2.5 % above. When you use the '
@@ -468,12 +474,13 @@ def _residuals(record: dict[str, Any], answer: Calibration) -> str:
     known = bool(np.isfinite(np.asarray(answer.elevation_sd)[used]).any())
     spread = ", with one standard deviation (grey)" if known else ""
     parts = [
-        f"<figure>{first}<figcaption>Residual of every image, one scale for all: the estimated "
-        "target less the measured point, taken in the image plane. Rings: images that do not fit "
-        "the rest, or are suspicious."
-        "</figcaption></figure>",
-        f"<figure>{second}<figcaption>Estimated distance of the target from the image plane{spread}"
-        ".</figcaption></figure>",
+        _figure(
+            first,
+            "Residual of every image, one scale for all: the estimated target less the measured "
+            "point, taken in the image plane. Rings: images that do not fit the rest, or are "
+            "suspicious.",
+        ),
+        _figure(second, f"Estimated distance of the target from the image plane{spread}."),
     ]
     influence = record["influence"]
     if influence is not None:
@@ -485,10 +492,10 @@ def _residuals(record: dict[str, Any], answer: Calibration) -> str:
             "How far leaving out an image would change the calibration, mm in the image",
             height=120.0,
         )
-        parts[1] += (
-            f"<figure>{third}<figcaption>How far points of the image would move if one image were "
-            "left out (to first order). Rings: the three images with the largest effect."
-            "</figcaption></figure>"
+        parts[1] += _figure(
+            third,
+            "How far points of the image would move if one image were left out (to first order). "
+            "Rings: the three images with the largest effect.",
         )
     words = [*frames_of_images(record), *resampled_sentences(record)]
     if len(used) > svg.MOST_DRAWN:
@@ -583,8 +590,7 @@ def _observability(record: dict[str, Any]) -> str:
         )
         parts.append(
             f'<div class="grid">{_table(rows, ("", "unknown", "standard deviation"), 2)}'
-            f"<figure>{drawn}<figcaption>Correlations: orange positive, blue negative.</figcaption>"
-            "</figure></div>"
+            f"{_figure(drawn, 'Correlations: orange positive, blue negative.')}</div>"
         )
     return _section("What the images determine", *parts)
 

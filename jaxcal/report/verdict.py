@@ -97,8 +97,8 @@ def frames_of_images(record: dict[str, Any]) -> list[str]:
     suspected = (each["image"] for each in record["suspects"])
     second = _unmodelled(record).get("images") or []
     clipped = ((record.get("tre") or {}).get("clipped") or {}).get("images", [])
-    listed = *second[:MOST_IMAGES], *clipped[:MOST_IMAGES]
-    named = {*record["outliers"], *suspected, *influence["most"][:3], *listed}
+    named = {*record["outliers"], *suspected, *influence["most"][:3]}
+    named |= {*second[:MOST_IMAGES], *clipped[:MOST_IMAGES]}
     told = [] if frame is None else [(k, frame[k]) for k in sorted(named) if frame[k] != k]
     if not told:
         return []

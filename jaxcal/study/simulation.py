@@ -119,20 +119,15 @@ class Protocol:
             raise InputError("depth_mm must be two numbers: nearest and farthest") from None
         for name, (largest, unit) in _LARGEST.items():
             for value in self.depth_mm if name == "depth_mm" else (getattr(self, name),):
-                if not is_traced(value) and not _is_within(value, largest):
-                    raise InputError(f"{name} must be between 0 and {largest}{unit}, not {value}")
+                good = is_traced(value) or (is_number(value) and 0 <= value <= largest)
+                if not good:
+                    told = shown(value)
+                    raise InputError(f"{name} must be between 0 and {largest}{unit}, not {told}")
         if not is_traced(self.depth_mm) and shallow > deep:
             raise InputError(f"depth_mm must be nearest, then farthest, not {self.depth_mm}")
         check_law(self.elevation_distribution)
         check_probe(self.probe)
         check_flag("raw", self.raw)
-
-
-def _is_within(value: Any, largest: int) -> bool:
-    try:
-        return 0 <= float(value) <= largest
-    except (TypeError, ValueError):
-        return False
 
 
 class Experiment(eqx.Module):
