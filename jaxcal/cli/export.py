@@ -136,15 +136,15 @@ def export(
     if pixel_size is not None:
         transform = transform.with_pixels(pixel_size, origin or (0.0, 0.0))
     if plus_config is not None:
-        for line in patched(transform, plus_config, out, frames):
-            click.echo(line)
+        said = patched(transform, plus_config, out, frames)
     elif plus_server is not None:
-        click.echo(sent(transform, plus_server, frames))
+        said = [sent(transform, plus_server, frames)]
     elif out is not None:
-        for line in written(transform, out, format, frames):
-            click.echo(line)
-    elif format is not None:
-        click.echo(transform.text(format, frames=frames), nl=False)
+        said = written(transform, out, format, frames)
+    else:
+        assert format is not None
+        said = transform.text(format, frames=frames).splitlines()
+    click.echo("\n".join(said))
     if named and probe_frame is None and (note := renamed(transform)) is not None:
         click.echo(f"- {note}", err=True)
     if transform.doubtful_unit is not None:

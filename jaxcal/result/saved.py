@@ -62,6 +62,13 @@ _EXTENSIONS: dict[SaveFormat, tuple[str, ...]] = {
 }
 
 
+def _endings(format: SaveFormat) -> tuple[str, ...]:
+    """The extensions of a format's files; InputError for something that is no format."""
+    if not (isinstance(format, str) and format in _EXTENSIONS):
+        raise InputError(f"{quoted(str(format))} is not a format that can be written")
+    return _EXTENSIONS[format]
+
+
 def _format_of(name: str) -> SaveFormat:
     for chosen, extensions in _EXTENSIONS.items():
         if name.lower().endswith(extensions):
@@ -88,16 +95,8 @@ def check_target(
     """
     name = path_name(path)
     chosen = _format_of(name) if format is None else format
-    extensions = _EXTENSIONS.get(chosen) if isinstance(chosen, str) else None
-    if extensions is None:
-        raise InputError(f"{quoted(str(chosen))} is not a format that can be written")
-    check_output(
-        path,
-        f"a calibration (format {chosen})",
-        lambda _: _is_one(path, chosen),
-        inputs,
-        endings=extensions,
-    )
+    endings, what = _endings(chosen), f"a calibration (format {chosen})"
+    check_output(path, what, lambda _: _is_one(path, chosen), inputs, endings=endings)
     return chosen
 
 
@@ -159,6 +158,7 @@ def save(
 
 def text_of(transform: ImageTransform, format: SaveFormat, *, frames: FramePair) -> str:
     """The text of a calibration in a format; see :meth:`ImageTransform.text`."""
+    _endings(format)
     if format == "json":
         try:
             return json.dumps(_record(transform), indent=2, allow_nan=False) + "\n"
@@ -192,9 +192,7 @@ def text_of(transform: ImageTransform, format: SaveFormat, *, frames: FramePair)
         rigid = matrix.copy()
         rigid[:3, :3] /= [*scale, scale.mean()]
         return calib_matrix(rigid, scale)
-    if format == "numpy":
-        return np.array2string(transform.plus_matrix(), separator=", ", floatmode="unique") + "\n"
-    raise InputError(f"{quoted(str(format))} is not a format that can be written")
+    return np.array2string(transform.plus_matrix(), separator=", ", floatmode="unique") + "\n"
 
 
 def utc_now() -> str:

@@ -135,17 +135,13 @@ class ImageTransform:
                 f"unknowns must be translation, rotation and others of {moving}, in this order"
             )
         size = len(tangent_names(blocks))
-        shapes = {
+        numbers = ("face_offset_mm", "range_factor", "tre_factor", "error_mm")
+        shapes: dict[str, tuple[int, ...]] = {
             "image_plane_to_probe": (4, 4),
             "scale_mm_per_px": (2,),
-            "face_offset_mm": (),
-            "range_factor": (),
-            "tre_factor": (),
-            "degrees_of_freedom": (),
-            "variance_factor": (),
+            **dict.fromkeys((*numbers, "degrees_of_freedom", "variance_factor"), ()),
             "covariance": (6, 6),
             "image_covariance": (size, size),
-            "error_mm": (),
         }
         for name in ("source", "probe_frame", "doubtful_unit"):
             value = getattr(self, name)

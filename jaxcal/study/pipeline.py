@@ -17,7 +17,7 @@ If a host has several devices, each takes its share of a block.
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import jax
@@ -26,7 +26,6 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array
 
 from jaxcal.data.probe import LinearProbe
-from jaxcal.model.batch import Iterate
 from jaxcal.model.unknowns import RIGID
 from jaxcal.runtime.compiler import fast_to_run, single_threaded
 from jaxcal.runtime.jax_modes import in_own_modes
@@ -36,7 +35,7 @@ from jaxcal.study.interface import Chunk
 from jaxcal.study.offsets import nominal_bound
 from jaxcal.study.simulation import Protocol, join_protocol, split_protocol
 from jaxcal.study.spec import Condition, MethodSpec, Spec
-from jaxcal.study.trials import Experiments, Kind, experiments, solve
+from jaxcal.study.trials import Kind, experiments, solve
 
 BATCH_SIZE = {"cpu": 64}
 """Trials drawn or solved side by side on a device; on a CPU what they need stays in its caches."""
@@ -189,11 +188,13 @@ def compile_pieces(function: Any, devices: Devices, *, pieces: int) -> Any:
 @cache
 def draw_program(shape: Protocol, devices: Devices) -> Any:
     """From (trial indices, seed, numbers) to :func:`jaxcal.study.trials.experiments`, compiled."""
-
-    def program(indices: Array, seed: Array, numbers: dict[str, Any]) -> Any:
-        return experiments(trial_keys(indices, seed), join_protocol(shape, numbers))
-
-    return compile_pieces(program, devices, pieces=1)
+    return compile_pieces(
+        lambda indices, seed, numbers: experiments(
+            trial_keys(indices, seed), join_protocol(shape, numbers)
+        ),
+        devices,
+        pieces=1,
+    )
 
 
 def trial_keys(indices: Array, seed: Array) -> Array:
@@ -205,20 +206,12 @@ def trial_keys(indices: Array, seed: Array) -> Array:
 @cache
 def begin_program(max_steps: int, devices: Devices) -> Any:
     """From experiments to their conventional fits, compiled."""
-
-    def program(batch: Experiments) -> ConventionalStart:
-        return conventional(batch.images, RIGID, max_steps=max_steps)
-
-    return compile_pieces(program, devices, pieces=1)
+    return compile_pieces(
+        lambda batch: conventional(batch.images, RIGID, max_steps=max_steps), devices, pieces=1
+    )
 
 
 @cache
 def solve_program(kind: Kind, options: Options, devices: Devices) -> Any:
     """From experiments, truth, conventional fits and bound to :func:`jaxcal.study.trials.solve`."""
-
-    def program(
-        batch: Experiments, truth: Iterate, begun: ConventionalStart, bound: Array | None
-    ) -> Any:
-        return solve(batch, truth, begun, kind, options, bound)
-
-    return compile_pieces(program, devices, pieces=3)
+    return compile_pieces(partial(solve, kind, options), devices, pieces=3)

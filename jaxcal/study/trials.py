@@ -135,21 +135,21 @@ def problems_of(images: ImagePlanes) -> Problem:
 
 
 def solve(
+    kind: Kind,
+    options: Options,
     batch: Experiments,
     truth: Iterate,
     begun: ConventionalStart,
-    kind: Kind,
-    options: Options,
     bound: Array | None,
 ) -> TrialResults:
     """One method on a batch.
 
     Args:
+        kind: the method.
+        options: its options.
         batch: the experiments.
         truth: that of the experiments.
         begun: their conventional fits.
-        kind: the method.
-        options: its options.
         bound: on the offsets, mm, for methods that take one.
     """
     images = batch.images
@@ -167,13 +167,11 @@ def solve(
         truth.further_values,
         truth.blocks,
     )
-    pairs = ((iterate.translation, truth.translation), (iterate.point, truth.point))
-    away = [jnp.sqrt(jnp.sum((one - true) ** 2, axis=0)) for one, true in pairs]
     return TrialResults(
         rp=_precision(iterate, truth, batch.test),
         rotation_error=chord_angle(iterate.rotation - truth.rotation),
-        translation_error=away[0],
-        point_error=away[1],
+        translation_error=jnp.linalg.norm(iterate.translation - truth.translation, axis=0),
+        point_error=jnp.linalg.norm(iterate.point - truth.point, axis=0),
         sigma=jnp.asarray(found.sigma),
         status=jnp.asarray(found.status_code, jnp.int8),
         iterations=jnp.asarray(found.convergence.iterations, jnp.int32),
