@@ -143,7 +143,7 @@ def export(
         said = written(transform, out, format, frames)
     else:
         assert format is not None
-        said = transform.text(format, frames=frames).splitlines()
+        said = [transform.text(format, frames=frames).removesuffix("\n")]
     click.echo("\n".join(said))
     if named and probe_frame is None and (note := renamed(transform)) is not None:
         click.echo(f"- {note}", err=True)
