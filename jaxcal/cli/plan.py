@@ -30,6 +30,8 @@ from jaxcal.report.paragraphs import simple_table
 from jaxcal.study.laws import OFFSET_LAWS, LawName
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from jaxcal.data.recording import Images
     from jaxcal.design import Candidates, Plan
     from jaxcal.design.constraints import Region
@@ -371,67 +373,74 @@ def _record(
 def _print(
     found: Plan, record: dict[str, Any], figure: str | None, until_tre: float | None
 ) -> None:
+    print_page(
+        _table(record),
+        *_region_in_words(record["region"]),
+        *_errors_in_words(found, record, until_tre),
+        *(_simulated_in_words(errors) for errors in record.get("simulated", ())),
+        *([] if figure is None else [f"figure: {figure}"]),
+    )
+
+
+def _table(record: dict[str, Any]) -> Table:
+    """How to hold the probe for each pose, where the target then is, and the error after it."""
     pixels = "target_px" in record["poses"][0]
     where = "u, v\n(px)" if pixels else "lateral, depth\n(mm)"
     hold = "how to hold the probe"
     table = simple_table(("", hold, where, "error then\n(mm)"), (hold,))
-    for k, pose in enumerate(record["poses"]):
+    for k, pose in enumerate(record["poses"], start=record["images_before"] + 1):
         lateral, depth = pose["target_px" if pixels else "target_mm"]
-        sign = " (fills space)" if pose["fills_space"] else ""
-        table.add_row(
-            str(found.known.images + k + 1),
-            pose["words"] + sign,
-            f"{lateral:z.0f}, {depth:z.0f}",
-            f"{pose['tre_mm']:#.3g}",
-        )
-    there = found.known.images
+        words = pose["words"] + " (fills space)" * pose["fills_space"]
+        table.add_row(str(k), words, f"{lateral:z.0f}, {depth:z.0f}", f"{pose['tre_mm']:#.3g}")
+    return table
+
+
+def _region_in_words(region: dict[str, Any]) -> list[str]:
+    (near, far), (left, right) = region["depth_mm"], region["lateral_mm"]
+    # Of a sector, neither is what the table says of a target beside the middle.
+    curved = region["radius_mm"] is not None
+    extent = "from the array, in front of its arc" if curved else "deep, laterally"
+    return [
+        f"Target {near:.0f} to {far:.0f} mm {extent} from {left:z.0f} to {right:z.0f} mm.",
+        "Tilts and turns from the middle orientation, with the marker to your right; left is where "
+        "the lateral position is smallest. Take them in any order.",
+    ]
+
+
+def _errors_in_words(found: Plan, record: dict[str, Any], until_tre: float | None) -> list[str]:
+    """The predicted errors, how many images others take, and what may be wrong with them."""
+    there, told = found.known.images, []
+    now = found.tre_mm[0]
+    if there and until_tre is not None and now <= until_tre:
+        told.append(f"The existing images reach {until_tre:g} mm already ({now:.2g} mm).")
+    these = "this image" if len(found) == 1 else f"these {len(found)} images"
+    before = f" added to the {there} existing ones" if there else ""
+    told.append(
+        # A test of real images has their own errors as well.
+        f"Predicted with {these}{before}: error over the image {found.tre_mm[-1]:.2g} mm, "
+        f"reconstruction precision of images without errors {found.rp_mm[-1]:.2g} mm."
+    )
     counts = [
         f"{wanted} mm: "
         + ("over 1000" if count is None else "reached" if count <= there else f"{count}")
         for wanted, count in record["images_to_tre_mm"].items()
     ]
-    (near, far), (left, right) = (record["region"][k] for k in ("depth_mm", "lateral_mm"))
-    # Of a sector, neither is what the table says of a target beside the middle.
-    curved = record["region"]["radius_mm"] is not None
-    extent = "from the array, in front of its arc" if curved else "deep, laterally"
-    total = "" if not there else ", the existing ones included,"
-    before = "" if not there else f" added to the {there} existing ones"
-    reached: list[str] = []
-    if there and until_tre is not None and found.tre_mm[0] <= until_tre:
-        now = f"({found.tre_mm[0]:.2g} mm)"
-        reached.append(f"The existing images reach {until_tre:g} mm already {now}.")
-    doubt: list[str] = []
+    total = ", the existing ones included," if there else ""
+    least = ""
+    if not there and len(found) < MINIMUM_SELF_TUNING:
+        least = f" (never fewer than {MINIMUM_SELF_TUNING}, which estimating the errors' SDs takes)"
+    told.append(f"Images needed{total} for an error of {'; '.join(counts)}{least}.")
     if record.get("contradictions") or record.get("outliers"):
         what = (
             "what contradicts the noise model"
             if record["contradictions"]
             else "images that do not fit the rest"
         )
-        doubt.append(
+        told.append(
             f"These errors are by the noise model alone. First see to the images that there are: "
             f"the verdict of jaxcal calibrate names {what}."
         )
-    few = not there and len(found) < MINIMUM_SELF_TUNING
-    least = (
-        f" (never fewer than {MINIMUM_SELF_TUNING}, which estimating the errors' SDs takes)"
-        if few
-        else ""
-    )
-    these = "this image" if len(found) == 1 else f"these {len(found)} images"
-    print_page(
-        table,
-        f"Target {near:.0f} to {far:.0f} mm {extent} from {left:z.0f} to {right:z.0f} mm.",
-        "Tilts and turns from the middle orientation, with the marker to your right; left is where "
-        "the lateral position is smallest. Take them in any order.",
-        *reached,
-        # A test of real images has their own errors as well.
-        f"Predicted with {these}{before}: error over the image {found.tre_mm[-1]:.2g} mm, "
-        f"reconstruction precision of images without errors {found.rp_mm[-1]:.2g} mm.",
-        *([f"Images needed{total} for an error of {'; '.join(counts)}{least}."] if counts else []),
-        *doubt,
-        *(_simulated_in_words(errors) for errors in record.get("simulated", ())),
-        *([] if figure is None else [f"figure: {figure}"]),
-    )
+    return told
 
 
 def _simulated_in_words(errors: dict[str, Any]) -> str:

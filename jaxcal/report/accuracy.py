@@ -177,15 +177,14 @@ def _limits(
     answer: Calibration, found: Influence, weight: Float[np.ndarray, "p p"]
 ) -> dict[str, Any]:
     """Shares of the mean square error at the image, and of the scatter of the target."""
-    residual = np.asarray(answer.residual)[np.asarray(answer.mask) > 0]
-    squares = np.mean(residual**2, axis=0)
+    lateral, axial, elevational = _mean_squares(answer)
     return {
         "error_share": dict(zip(KINDS, error_shares(answer, found, weight), strict=True)),
         "scatter_share": dict(zip(KINDS, scatter_shares(answer), strict=True)),
-        "rms_lateral_mm": math.sqrt(squares[0]),
-        "rms_axial_mm": math.sqrt(squares[2]),
-        "rms_elevational_mm": math.sqrt(squares[1]),
-        "rms_in_plane_mm": math.sqrt(squares[0] + squares[2]),
+        "rms_lateral_mm": math.sqrt(lateral),
+        "rms_axial_mm": math.sqrt(axial),
+        "rms_elevational_mm": math.sqrt(elevational),
+        "rms_in_plane_mm": math.sqrt(lateral + axial),
     }
 
 
@@ -202,10 +201,15 @@ def error_shares(
     return part / part.sum()
 
 
+def _mean_squares(answer: Calibration) -> Float[np.ndarray, " kinds"]:
+    """Mean square residual of each of :data:`KINDS`, mm^2."""
+    residual = np.asarray(answer.residual)[np.asarray(answer.mask) > 0]
+    return np.mean(residual**2, axis=0)[[0, 2, 1]]
+
+
 def scatter_shares(answer: Calibration) -> Float[np.ndarray, " kinds"]:
     """Shares of :data:`KINDS` in the mean square residual; NaN if there is none."""
-    residual = np.asarray(answer.residual)[np.asarray(answer.mask) > 0]
-    squares = np.mean(residual**2, axis=0)[[0, 2, 1]]
+    squares = _mean_squares(answer)
     whole = float(squares.sum())
     return squares / whole if whole > 0 else np.full(len(KINDS), np.nan)
 

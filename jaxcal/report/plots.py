@@ -182,8 +182,7 @@ def plot_offsets(calibration: Calibration, truth: Float[np.ndarray, " n"] | None
 
 def plot_influence(calibration: Calibration) -> Figure:
     """How far leaving out each image moves image points, mm, and how far is expected."""
-    answer, recording = _determined(calibration, "nothing can be left out")
-    weight = _weight(answer, recording)
+    answer, weight = _weighed(calibration, "nothing can be left out")
     moved, expected = in_image(influence_of(answer), weight)
     used = np.flatnonzero(np.asarray(answer.mask) > 0)
     figure = canvas(PAGE_MM, 60.0)
@@ -215,8 +214,7 @@ def plot_limits(calibration: Calibration) -> Figure:
     Raises:
         InputError: X is not observable.
     """
-    answer, recording = _determined(calibration, "its error has no shares")
-    weight = _weight(answer, recording)
+    answer, weight = _weighed(calibration, "its error has no shares")
     shares = error_shares(answer, influence_of(answer), weight)
     figure = canvas(PAGE_MM, 38.0)
     panel = styled(figure.subplots())
@@ -283,9 +281,13 @@ def convergence_figure(curves: list[Curve]) -> Figure:
     return figure
 
 
-def _weight(answer: Calibration, recording: Recording) -> Float[np.ndarray, "p p"]:
+def _weighed(
+    calibration: Calibration, otherwise: str
+) -> tuple[Calibration, Float[np.ndarray, "p p"]]:
+    """A calibration that is determined, and W of the mean square error over its region."""
+    answer, recording = _determined(calibration, otherwise)
     grid = region_of(answer, recording).grid()[:, [0, 2]]
-    return mean_of_squares(image_jacobian(answer, grid))
+    return answer, mean_of_squares(image_jacobian(answer, grid))
 
 
 def _one(calibration: Calibration) -> tuple[Calibration, Recording]:
