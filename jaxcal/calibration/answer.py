@@ -228,11 +228,8 @@ def _residual_variance(
 ) -> Float[Array, "*batch"]:
     """Variance of the residuals of fits in mm, mm^2; 1 for residuals in SDs.
 
-    Args:
-        used: number of images in use.
-        in_plane: sum of squared errors from targets in the image plane, mm^2.
-        bounds: state of bounded offsets, if the method has them.
-        plan: of the solve.
+    ``in_plane`` is the sum of squared errors from targets in the image plane, mm^2, over the
+    ``used`` images.
     """
     known = count_unknowns(plan.blocks)
     if bounds is not None:

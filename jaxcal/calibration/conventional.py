@@ -132,12 +132,9 @@ def _convergence(
 ) -> Convergence:
     """That the closed form took no iteration, and how stationary the answer is.
 
-    Args:
-        rows: derivatives of the errors by the unknowns.
-        errors: residuals of all images, mm; 0 where not used.
-        design: normal matrix of these rows.
-        exact: the errors are only rounding, and their gradient means nothing.
-        plan: the request.
+    ``rows`` are the derivatives of the ``errors`` (mm; 0 where not used) by the unknowns, and
+    ``design`` is their normal matrix. If the errors are ``exact``, only rounding, their gradient
+    means nothing.
     """
     objective = float(errors @ errors)
     gradient = np.abs(errors @ rows)

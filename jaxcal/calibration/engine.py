@@ -167,16 +167,12 @@ def _solve_chunks_kept(
 ) -> tuple[Calibration, bool]:
     """Solve a batch (one leading axis) by a kept program, which serves batches of nearly its size.
 
-    Args:
-        problems: the batch.
-        given: numbers that came with the request.
-        plan: what is static about it.
-        largest: most problems solved side by side.
-        last: the caller does nothing to the result afterwards.
+    At most ``largest`` problems are solved side by side.
 
     Returns:
-        The result and True: finished, in JAX arrays, if the caller does nothing to it and the batch
-        needed no padding. Else the result in numpy arrays, padding included, and False.
+        The result and True: finished, in JAX arrays, if the caller does nothing to it afterwards
+        (``last``) and the batch needed no padding. Else the result in numpy arrays, padding
+        included, and False.
     """
     count, images = problems.mask.shape
     chunk = min(bucket(count), largest)
@@ -253,12 +249,9 @@ def _label(plan: SolvePlan, images: int) -> dict[str, Any]:
 
 
 def _is_kept(problems: Problem, plan: SolvePlan, *, inside: bool) -> bool:
-    """Whether a kept program solves it: on one CPU, and by our own solvers.
+    """Whether a kept program solves one problem or many: on one CPU, and by our own solvers.
 
-    Args:
-        problems: one or many.
-        plan: what is static about the request.
-        inside: this is inside a jit, vmap or grad of the caller's.
+    It does not if this is ``inside`` a jit, vmap or grad of the caller's.
     """
     if inside or not executables.is_describable(plan):
         return False

@@ -295,13 +295,9 @@ def _in_batches(
     images: int,
     arguments: dict[str, Any],
 ) -> Calibration:
-    """Calibrations of many versions of a problem, without their data.
+    """Calibrations of ``count`` versions of a problem, without their data.
 
-    Args:
-        make: the versions with some numbers.
-        count: how many there are.
-        images: in each of them.
-        arguments: as for :func:`jaxcal.calibrate`.
+    ``make`` returns the versions of given numbers; each has as many ``images``.
     """
     # Outliers were found with all images.
     arguments = {**arguments, "robust": False}

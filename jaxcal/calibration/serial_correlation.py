@@ -192,9 +192,7 @@ def _cosine_transform(values: Float[np.ndarray, "n k q"]) -> Float[np.ndarray, "
 def _models(count: int, slow: float) -> tuple[Float[np.ndarray, "g n"], Float[np.ndarray, " g"]]:
     """Variances of the cosine transform of errors with variance 1, and the prior of each model.
 
-    Args:
-        count: number of images.
-        slow: share of the models of a slow path, from 0 to 1.
+    ``slow`` is the share of the models of a slow path, from 0 to 1.
     """
     usual = (1 - slow) * (count >= FEWEST_SUCCESSIVE)
     spectra, belief = [np.ones((1, count))], [np.array([1 - (1 - INDEPENDENT) * (usual + slow)])]
@@ -291,10 +289,8 @@ def _leverage_and_squares(
 ) -> tuple[Float[np.ndarray, " g"], Float[np.ndarray, " g"]]:
     """tr(S^-1 J_k' C_k^-1 J_k) and r' C_k^-1 r of one kind, r its errors after the fit.
 
-    Args:
-        joint: products of the unknowns' rows and, last, of the errors, of all kinds; S is its part
-            without the errors.
-        own: those of this kind.
+    ``joint`` has products of the unknowns' rows and, last, of the errors, of all kinds, and ``own``
+    those of this kind; S is the part of ``joint`` without the errors.
     """
     right = np.concatenate([own[:, :-1, :-1], joint[:, :-1, -1:]], axis=2)
     solved = np.linalg.solve(joint[:, :-1, :-1], right)
