@@ -139,8 +139,8 @@ def cross_validate(
     Args:
         problem: one problem, a recording, or one set of images.
         folds: the images in use are dealt to so many folds in turn; by default every image is a
-            fold of its own, up to :data:`MOST_FOLDS`. Inside a transformation, where nobody knows
-            yet which images are in use, all are dealt.
+            fold of its own, up to :data:`MOST_FOLDS`. Inside a transformation,
+            where it is not known which images are in use, all are dealt.
         result: the calibration of all images, if it exists already: by the same method, with the
             same prior, data and unknowns. Images that it left out as outliers are neither used nor
             held out.

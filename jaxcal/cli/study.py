@@ -116,7 +116,7 @@ def _command(spec: str, out: str, workers: int | None, dask: str | None) -> str:
 
 
 _LINE_EVERY_S = 60.0
-"""Time between two lines of progress where nobody watches."""
+"""Time between two lines of progress if standard error is no terminal."""
 
 
 class _Lines:

@@ -219,7 +219,7 @@ def _unmodelled(
 ) -> dict[str, Any] | None:
     """The clearest error that the model leaves out, and how far it moves the image.
 
-    One imitates another, so ``also`` is the next one if it is nearly as likely.
+    Such errors can look alike, so ``also`` is the next one if it is nearly as likely.
     """
     found = unmodelled(answer, velocity)
     if not found:
@@ -241,7 +241,7 @@ def _unmodelled(
 
     first = found[0]
     near = (each for each in found[1:] if first.statistic - each.statistic < NEARLY)
-    # What is said of one motion asks for the others as well.
+    # The advice about one motion covers the others.
     also = next((each for each in near if {first.kind, each.kind} - MOTIONS), None)
     return {**told(first), "also": also and told(also)}
 

@@ -86,7 +86,7 @@ def _unexplained(record: dict[str, Any]) -> list[str]:
 
 
 def usable(record: dict[str, Any]) -> bool:
-    """Whether there is an answer, of data in the right frames, to be told about."""
+    """Whether there is an answer, from data in the right frames."""
     return record["status"] in ("converged", "max_iterations") and not record.get("wrong_frames")
 
 

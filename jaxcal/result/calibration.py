@@ -339,7 +339,7 @@ class Calibration(OneOrBatch):
     def doubtful_unit(self) -> str | None:
         """Why the poses may be in another unit than mm, in words, and what to do (one problem).
 
-        None where nothing speaks for it. If there is a text, the error to expect is not known.
+        None without a sign of it. If there is a text, the error to expect is not known.
 
         Raises:
             CalibrationError: under a JAX transformation.

@@ -1,7 +1,7 @@
 """Monte-Carlo studies: a grid of conditions x methods x trials, computed in resumable chunks.
 
 spec.py      what is to be computed, from a TOML file
-interface.py what the engine needs of a study, for studies of one's own
+interface.py what the engine needs of a study, for studies of a caller's own
 pipeline.py  one chunk: draw, segment, solve by every method, compare with the truth
 trials.py    the computation of its trials, as far as their results are stored
 store.py     one HDF5 file per chunk; what is there, what is missing

@@ -60,7 +60,7 @@ _TALKING = ("distributed", "distributed.client")
 
 _LOST = "the cluster was lost: its scheduler no longer answers"
 
-# Others than these, such as inproc://, are Dask's own affair.
+# Dask itself checks addresses of other kinds, such as inproc://.
 _ADDRESS = re.compile(r"((tcp|tls|wss?|ucx)://)?\S+:\d{1,5}|(?!(tcp|tls|wss?|ucx):)\w+://\S+")
 
 

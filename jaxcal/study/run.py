@@ -82,7 +82,7 @@ def run_study(
     files are then the same as without the interruption (on one machine).
 
     Args:
-        spec: the study: a :class:`jaxcal.study.Spec`, or one of one's own
+        spec: the study: a :class:`jaxcal.study.Spec`, or a caller's own
             (:class:`jaxcal.study.Study`).
         folder: where its files are.
         resume: continue what is there; without it a folder that holds a study is refused.
