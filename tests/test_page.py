@@ -107,6 +107,16 @@ def tags(text):
     return parser
 
 
+def test_what_a_named_error_explains_is_not_listed_once_more(record, result, recording):
+    groups = "noise model: the range errors come in two groups"
+    for kind, listed in (("step", False), ("skew", True)):
+        tre = {**record["tre"], "unmodelled": {"kind": kind}}
+        changed = {**record, "tre": tre, "warnings": [groups, "another one"]}
+        shown = page(changed, result, recording).partition('id="record"')[0]
+        assert "<li>another one</li>" in shown
+        assert (f"<li>{groups}</li>" in shown) == listed
+
+
 def test_numbers_are_those_of_the_record(tags, record):
     assert len(tags.told) > 40
     for (path, form), shown in tags.told.items():

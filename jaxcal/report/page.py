@@ -36,6 +36,7 @@ from jaxcal.report.verdict import (
     advice,
     believe,
     certainty,
+    findings,
     fine_form,
     frames_of_images,
     headline,
@@ -233,8 +234,7 @@ def _head(record: dict[str, Any]) -> str:
 def _findings(record: dict[str, Any]) -> str:
     """What looks wrong, from all checks, and what to do about it."""
     parts = []
-    first = headline(record)
-    if found := [text for text in record["warnings"] if text not in first]:
+    if found := findings(record):
         parts += ["<h3>Look at this</h3>", as_html([BULLET + text for text in found])]
     if todo := advice(record):
         parts += ["<h3>What to do</h3>", as_html([BULLET + text for text in todo])]

@@ -67,8 +67,7 @@ def verdict(record: dict[str, Any]) -> list[str]:
     lines = [headline(record)]
     if usable(record):
         lines += [*why_larger(record), *where(record)]
-    further = [text for text in _unexplained(record) if text not in lines[0]]
-    lines += [*listed("Look at this", further), *listed("What to do", advice(record))]
+    lines += [*listed("Look at this", findings(record)), *listed("What to do", advice(record))]
     if usable(record):
         lines += listed("What limits it", limits(record))
         lines += listed("How certain it is", [*certainty(record), *resampled_sentences(record)])
@@ -77,12 +76,13 @@ def verdict(record: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _unexplained(record: dict[str, Any]) -> list[str]:
-    """Warnings but for misfits of errors within the image that a named error explains."""
-    if not usable(record) or _unmodelled(record).get("kind") not in SHIFTS:
-        return record["warnings"]
-    effects = tuple(f"{MISFIT}: the {name}" for name in WITHIN_THE_IMAGE)
-    return [text for text in record["warnings"] if not text.startswith(effects)]
+def findings(record: dict[str, Any]) -> list[str]:
+    """What looks wrong, but for what the first sentence says or a named error explains."""
+    effects = ()
+    if usable(record) and _unmodelled(record).get("kind") in SHIFTS:
+        effects = tuple(f"{MISFIT}: the {name}" for name in WITHIN_THE_IMAGE)
+    first = headline(record)
+    return [text for text in record["warnings"] if not (text in first or text.startswith(effects))]
 
 
 def usable(record: dict[str, Any]) -> bool:
