@@ -50,6 +50,7 @@ from jaxcal.model.thresholds import MAD
 from jaxcal.model.unknowns import RIGID
 from jaxcal.runtime.array_types import Bool, Float, Int
 from jaxcal.runtime.arrays import like
+from jaxcal.runtime.messages import first_ones
 from jaxcal.solvers.closed_form.single import solve_problem
 
 SAME_POSE_MM = 1.0
@@ -129,11 +130,10 @@ class IndependentImages:
         """What was done, in a sentence each; empty where all images are used and independent."""
         told = []
         if self.frozen:
-            named = ", ".join(map(str, self.frozen[:10])) + ", ..." * (len(self.frozen) > 10)
             told.append(
                 f"left out {len(self.frozen)} images, counted from 0, whose pose is that of "
                 f"another one (within {FROZEN_MM:g} mm) while the target moves in them (was "
-                f"tracking frozen?): {named}"
+                f"tracking frozen?): {first_ones(self.frozen)}"
             )
         if self.stride > 1:
             alike = self.alike * self.frames / self.poses

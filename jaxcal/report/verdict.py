@@ -21,6 +21,7 @@ from jaxcal.report.contradictions import (
 from jaxcal.report.paragraphs import listed
 from jaxcal.report.resampled import resampled_sentences
 from jaxcal.result.saved import ASKED_FOR
+from jaxcal.runtime.messages import first_ones
 from jaxcal.solvers.plan import TUNED
 
 ENOUGH_IMAGES = 20
@@ -31,9 +32,6 @@ error."""
 
 CLEAR_SDS = 2.0
 """A gain in log density counts from so many of its standard errors on."""
-
-_MOST_FRAMES = 10
-"""Largest number of images whose frames are named."""
 
 _AXES = ("lateral (sideways)", "elevational (out-of-plane)", "axial (depth)")
 _MORE_VARIED = (
@@ -99,13 +97,14 @@ def frames_of_images(record: dict[str, Any]) -> list[str]:
     clipped = ((record.get("tre") or {}).get("clipped") or {}).get("images", [])
     named = {*record["outliers"], *suspected, *influence["most"][:3]}
     named |= {*second[:MOST_IMAGES], *clipped[:MOST_IMAGES]}
-    told = [] if frame is None else [(k, frame[k]) for k in sorted(named) if frame[k] != k]
+    if frame is None:
+        return []
+    told = [f"image {k} is frame {frame[k]}" for k in sorted(named) if frame[k] != k]
     if not told:
         return []
-    pairs = ", ".join(f"image {image} is frame {number}" for image, number in told[:_MOST_FRAMES])
-    more = ", ..." if len(told) > _MOST_FRAMES else ""
     return [
-        f"Images are counted from 0 in the recording; in the file that it came from, {pairs}{more}."
+        "Images are counted from 0 in the recording; in the file that it came from, "
+        f"{first_ones(told)}."
     ]
 
 
@@ -454,8 +453,7 @@ def _check_outliers(record: dict[str, Any]) -> str | None:
     if not outliers:
         return None
     plural, was, them = ("", "was", "it") if len(outliers) == 1 else ("s", "were", "them")
-    more = ", ..." if len(outliers) > 10 else ""
-    images = f"image{plural} {', '.join(map(str, outliers[:10]))}{more} (counted from 0)"
+    images = f"image{plural} {first_ones(outliers)} (counted from 0)"
     if record.get("robust"):
         return f"Check {images}, which {was} left out, and pick the target in {them} again."
     return (

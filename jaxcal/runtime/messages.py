@@ -38,6 +38,11 @@ def enumerated(words: Sequence[str]) -> str:
     return " and ".join([", ".join(words[:-1]), words[-1]] if words[1:] else words)
 
 
+def first_ones(items: Sequence[object], most: int = 10) -> str:
+    """The first items, with commas between them, and dots if there are more."""
+    return ", ".join([*map(str, items[:most]), *["..."] * (len(items) > most)])
+
+
 def seconds(moment: float) -> str:
     """A time stamp, to the millisecond also where it counts from 1970, for a message."""
     return f"{moment:.3f} s"
