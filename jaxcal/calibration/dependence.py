@@ -418,7 +418,7 @@ def _with_arrays(data: Any, values: dict[str, np.ndarray]) -> Any:
 def _alike_for(problem: Problem, estimate: tuple[str, ...]) -> float:
     """For how many images of a stream the errors stay alike; 1 for other recordings."""
     poses = np.asarray(problem.poses, float)[np.asarray(problem.mask) > 0]
-    if step_share(poses) >= CONTINUOUS_SHARE:
+    if not step_share(poses) < CONTINUOUS_SHARE:
         # Errors that are alike for long are then no stream's: a mount has slipped, say.
         return 1.0
     errors = _conventional_errors(problem, estimate)

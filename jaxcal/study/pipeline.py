@@ -188,13 +188,11 @@ def compile_pieces(function: Any, devices: Devices, *, pieces: int) -> Any:
 @cache
 def draw_program(shape: Protocol, devices: Devices) -> Any:
     """From (trial indices, seed, numbers) to :func:`jaxcal.study.trials.experiments`, compiled."""
-    return compile_pieces(
-        lambda indices, seed, numbers: experiments(
-            trial_keys(indices, seed), join_protocol(shape, numbers)
-        ),
-        devices,
-        pieces=1,
-    )
+
+    def program(indices: Array, seed: Array, numbers: dict[str, Any]) -> Any:
+        return experiments(trial_keys(indices, seed), join_protocol(shape, numbers))
+
+    return compile_pieces(program, devices, pieces=1)
 
 
 def trial_keys(indices: Array, seed: Array) -> Array:
