@@ -315,7 +315,6 @@ for call, *given in (
     (lambda depth: jaxcal.Protocol(depth_mm=depth), 10),
     (lambda depth: jaxcal.Protocol(depth_mm=depth), (-1, 10)),
     (lambda noise: jaxcal.Protocol(noise_mm=noise), "a"),
-    (lambda noise: jaxcal.Protocol(noise_mm=noise), "0.5"),
     (lambda images: jaxcal.Protocol(images=images), 8.5),
     (jaxcal.Problem.from_arrays, poses + 0j, points),
     (jaxcal.Problem.from_arrays, poses, points.tolist()[:-1] + [[1.0]]),
@@ -465,6 +464,7 @@ for call, *given in (
     (jax.jit(lambda value: jaxcal.Options(tolerance_mm=value) and value), 0.1),
     *((lambda names, call=call: call(problem, estimate=names), [["scale"]])
       for call in (jaxcal.calibrate, jaxcal.calibrate_closed_form)),
+    (lambda noise: jaxcal.Protocol(noise_mm=noise), "0.5"),
 ):
     try:
         call(*given)
@@ -476,7 +476,7 @@ for call, *given in (
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stderr == ""
     lines = done.stdout.splitlines()
-    assert len(lines) == 228
+    assert len(lines) == 229
     assert lines[0].startswith("jaxcal.calibrate takes a problem, not a path: ")
     assert lines[3].startswith("jaxcal.calibrate_batch takes a problem or a recording, not int: ")
     assert lines[4] == "points must have shape (..., 2), not (1, 3)"
