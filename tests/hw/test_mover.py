@@ -261,13 +261,18 @@ def test_a_kick_that_hangs_ends_the_process_as_any_command_does(monkeypatch):
 
 def test_the_alarm_rings_though_a_caller_has_it_ignored_and_blocked():
     """What it starts inherits both: a command that hangs was ended two seconds later, or never."""
-
-    def deaf() -> None:
-        signal.signal(signal.SIGALRM, signal.SIG_IGN)
-        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGALRM, signal.SIGTERM})
-
-    start = [sys.executable, "-m", "hw.robot.mover"]
-    with subprocess.Popen(start, stdin=subprocess.PIPE, preexec_fn=deaf) as mover:
+    deaf = (
+        "import os, signal, sys\n"
+        "signal.signal(signal.SIGALRM, signal.SIG_IGN)\n"
+        "signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGALRM, signal.SIGTERM})\n"
+        "print('deaf', flush=True)\n"
+        "os.execv(sys.executable, [sys.executable, '-m', 'hw.robot.mover'])"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", deaf], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as mover:
+        assert mover.stdout is not None
+        assert mover.stdout.readline() == b"deaf\n"
         deadline = time.monotonic() + 60.0
         # It waits for its setup; until it listens, nothing rings.
         while mover.poll() is None and time.monotonic() < deadline:
