@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from test_geometry import random_poses
+from conftest import random_poses
 
 from jaxcal import (
     InputError,
@@ -17,7 +17,7 @@ from jaxcal import (
 
 def test_reconstruction_precision_is_the_norm_of_unbiased_sds():
     rng = np.random.default_rng(0)
-    poses, transform = random_poses(0, 9), random_poses(1, 1)[0]
+    poses, transform = random_poses(9, 0), random_poses(1, 1)[0]
     points = rng.normal(size=(9, 2)) * 30
     cloud = np.stack(
         [(b @ transform @ [x, 0, r, 1])[:3] for b, (x, r) in zip(poses, points, strict=True)]
@@ -45,7 +45,7 @@ def test_the_precision_of_a_calibration_is_that_of_its_transform():
 
 
 def test_a_single_image_has_no_scatter():
-    pose, points = random_poses(0, 3), np.full((3, 2), 20.0)
+    pose, points = random_poses(3, 0), np.full((3, 2), 20.0)
     for mask in ([1.0, 0.0, 0.0], np.zeros(3)):
         with pytest.raises(InputError, match="at least two images"):
             reconstruction_precision(np.eye(4), pose, points, np.array(mask))
@@ -56,7 +56,7 @@ def test_reproducibility_of_shifted_calibrations():
     transforms[1, 1, 3] = 4.0
     corners = np.array([[-20.0, 0], [20, 0], [-20, 80], [20, 80], [0, 40]])
     np.testing.assert_allclose(calibration_reproducibility(transforms, corners), 2.0)
-    turned = random_poses(5, 3)
+    turned = random_poses(3, 5)
     spread = calibration_reproducibility(turned, corners)
     points = np.stack([corners[:, 0], 0 * corners[:, 0], corners[:, 1]], axis=1)
     images = np.einsum("kij,mj->kmi", turned[:, :3, :3], points) + turned[:, None, :3, 3]

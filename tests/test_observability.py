@@ -7,8 +7,7 @@ from dataclasses import replace
 import jax
 import numpy as np
 import pytest
-from conftest import problem
-from test_geometry import random_poses
+from conftest import problem, random_poses
 
 import jaxcal
 from jaxcal.model.batch import ImagePlanes, Iterate
@@ -28,7 +27,7 @@ METHODS = [
 
 def in_plane(rotations: np.ndarray, points: np.ndarray, noise: float = 0.05, seed: int = 0):
     """A problem with given probe rotations and [lateral, depth] points, and its true X."""
-    truth = random_poses(11, 1)[0]
+    truth = random_poses(1, 11)[0]
     target = np.array([30.0, -20.0, 100.0])
     poses = np.tile(np.eye(4), (len(points), 1, 1))
     poses[:, :3, :3] = rotations
@@ -74,7 +73,7 @@ def test_degenerate_sets_are_unobservable_and_named(arguments):
 
 
 def test_rotation_about_one_axis_names_the_translation_along_it():
-    truth = random_poses(11, 1)[0]
+    truth = random_poses(1, 11)[0]
     # The axis common to all poses, here the image's own axial one seen from the probe.
     axis = truth[:3, 2]
     data, _ = in_plane(turned(12, 0.5, axis=axis), spread(12))
