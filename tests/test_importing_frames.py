@@ -634,7 +634,7 @@ def tracked(times, poses) -> TrackedSequence:
             r"poses from 1778070100.000 s to 1778070103.980 s: .* the same clock,",
         ),
         # The images' times would be in ms.
-        (100.199 + MOMENTS / 1000, r"1 of \d+ images lies between poses .*'time \(ms\)'"),
+        (100.199 + MOMENTS / 1000, r"1 of \d+ images between poses .*'time \(ms\)'"),
         (MOMENTS[::-1], "is before the one before it"),
         (np.full(200, np.nan), "states no times"),
         (np.full(200, 101.0), "one time stamp"),

@@ -99,6 +99,9 @@ and this length. Even a third of wrong images does not raise the median so far."
 TRIMMED_FITS = 3
 """Fits to the two thirds of the images with the least errors, which show whether few are wrong."""
 
+WRONG_TIMES = 16.0
+"""Few are wrong if their errors exceed the others' median by this factor, and ``UNFIT_MM``."""
+
 UNITS = {1000.0: "metres", 100.0: "dm", 25.4: "inches", 10.0: "cm"}
 """Units that may be mistaken for mm; the keys are their lengths in mm."""
 
@@ -186,7 +189,7 @@ def _few_wrong(data: ImageData, fit: _Fit, best: float) -> str | None:
         found = refit
     errors = _errors(data, found)[0]
     rest = float(np.median(errors[kept]))
-    wrong = int((errors > max(UNFIT_MM, FARTHER * rest)).sum())
+    wrong = int((errors > max(UNFIT_MM, WRONG_TIMES * rest)).sum())
     if rest > UNFIT_MM / 2 or not 0 < wrong <= count // 3 or best <= FACTOR * count * rest**2:
         return None
     return (

@@ -12,6 +12,7 @@ from jaxcal.diagnostics.residual_checks import FEWEST_TO_CHECK
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import AnyArray
 from jaxcal.runtime.arrays import plain
+from jaxcal.runtime.messages import first_ones
 
 SUSPECTED = 0.01
 """Share of recordings with Gaussian errors in which chance alone makes an image suspect."""
@@ -78,9 +79,9 @@ def listed_outliers(result: HasOutliers, components: tuple[str, ...] = KINDS) ->
     reasons = outlier_reasons(result, components)
     told = [
         f"{reason['image']} ({reason['component']}, {abs(reason['sds'] or 0):.0f} SDs)"
-        for reason in reasons[:10]
+        for reason in reasons
     ]
-    return ", ".join(told) + (", ..." if len(reasons) > 10 else "")
+    return first_ones(told)
 
 
 def suspects(result: Calibration) -> list[OutlierReason]:
@@ -120,7 +121,7 @@ def suspects_in_words(result: Calibration) -> list[str]:
         else:
             runs.append([each])
     told = []
-    for run in runs[:10]:
+    for run in runs:
         sizes = sorted(abs(each["sds"] or 0) for each in run)
         first, last = run[0]["image"], run[-1]["image"]
         if first == last:
@@ -132,7 +133,7 @@ def suspects_in_words(result: Calibration) -> list[str]:
             )
     if not told:
         return []
-    listed = ", ".join(told) + (", ..." if len(runs) > 10 else "")
+    listed = first_ones(told)
     return [
         f"suspicious images: {listed}; their errors are too large for chance, but not large "
         "enough to leave them out: check them"

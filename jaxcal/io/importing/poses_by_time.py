@@ -197,7 +197,7 @@ def with_poses_by_time(
     too_long = len(images) > 1 and np.ptp(asked) * _SHORT > time[-1] - time[0]
     if too_long or not between.any():
         raise InputError(
-            f"{images.source}: {between.sum() or 'none'} of {counted(len(images), 'image')} lies "
+            f"{images.source}: {between.sum() or 'none'} of {counted(len(images), 'image')} "
             f"between poses of {track.source}: images are from {seconds(asked.min())} to "
             f"{seconds(asked.max())}, poses from {seconds(time[0])} to {seconds(time[-1])}: do "
             "they use the same clock, and seconds (milliseconds are read from a column "
