@@ -14,19 +14,19 @@ A share a of the variance of each kind is correlated by rho^|i - j| between imag
 is independent. The residuals do not show C_k as it is, since the fit absorbs slow errors more than
 quick ones. So every pair (rho, a) of a grid is weighed by its restricted likelihood given those
 residuals (profiled over the variance), times a prior: half for no correlation, the other half
-spread evenly over the grid, and less where the variance would be very large. The other kinds enter
-with their mean weights, in turn. C_k is then the weighed mean, which is the law of total variance,
-since every pair has the same estimate. So SDs grow by one to three percent where errors look
-independent and the poses change at random; nothing decides whether errors are correlated. The
-correction makes no answer more certain. The information P of priors on sound speed and delay is
-added to both sums.
+spread evenly over the grid. The other kinds enter with their mean weights, in turn. C_k is then the
+weighed mean, which is the law of total variance, since every pair has the same estimate. So SDs
+grow by one to three percent where errors look independent and the poses change at random; nothing
+decides whether errors are correlated. The correction makes no answer more certain. The information
+P of priors on sound speed and delay is added to both sums.
 
 *Slow paths.* Where the probe was placed anew for every image, errors have little reason to stay
 alike for long. Where it moved slowly all the time, whatever depends on its motion did so, too, and
-few images along such a path cannot tell a drift from a movement. Then the grid has integrated
-autocorrelation times t of up to several times the number of images, and beside the correlation
-above a smoother one, of an autoregression of second order with both roots at rho. The share of this
-grid in the prior follows from the size of the steps (:func:`slowness`).
+few images along such a path cannot tell a drift from a movement. Offsets that follow the movement
+have no more quick changes than the movement itself, which no power of a frequency describes. Then
+the grid has spectra that are flat up to a cut-off and fall behind it, slowly or steeply, with
+periods at the cut-off up to several times the recording. Their prior falls with their variance. The
+share of this grid in the prior follows from the size of the steps (:func:`slowness`).
 
 The cosine transform of a stationary series has nearly independent coefficients, whose variances are
 the spectral density. So no matrix of all images is formed: C_k is diagonal there.
@@ -38,7 +38,7 @@ series).
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -57,12 +57,25 @@ SLOW_SHARE, RANDOM_SHARE = 0.2, 0.4
 """Steps between images, as shares of the distance of poses half a recording apart: up to the first
 one a path is slow, and from the second one on poses change at random."""
 
-TIMES, SHORTEST_TIME, LONGEST_TIMES = 10, 1.15, 4.0
-"""Number of autocorrelation times that are weighed along a slow path, the shortest one in images,
+PERIODS, SHORTEST_PERIOD, LONGEST_PERIODS = 10, 4.0, 5.0
+"""Along a slow path: number of periods at the cut-off that are weighed, the shortest one in images,
 and the longest one in numbers of all images."""
+
+ORDERS = (1, 4, 16)
+"""Along a slow path: by which powers of the frequency, squared, the spectra fall behind it."""
 
 SHARES = np.array([1 / 3, 2 / 3, 1.0])
 """Shares of the variance that are correlated."""
+
+SLOW_SHARES = 1 - np.array([0.5, 0.1, 0.01, 0.001, 1e-12])
+"""Those along a slow path, where the fit absorbs most of the correlated part. (The last one is all,
+but for rounding.)"""
+
+SIZE_POWER = 0.4
+"""The prior of a model of a slow path is divided by this power of the variance, relative to that
+under independence. The fit absorbs nearly all of errors that last longer than the recording, so
+that they may have any size, and the mean of the variances would be that of the least likely model.
+"""
 
 INDEPENDENT = 0.5
 """Prior probability that errors of one kind are independent."""
@@ -75,11 +88,6 @@ ROUNDING_MM = 1e-9
 
 NEGLIGIBLE = 0.01
 """Errors with less than this share of the variance that they are given tell of no correlation."""
-
-PRIOR_VARIANCE = 10_000.0
-"""Mean of the exponential prior of a variance, relative to the one under independence. The fit
-absorbs nearly all of smooth errors that last longer than the recording, so that they may have any
-size, and the mean of the variances would be that of the least likely model."""
 
 ROUNDS, STEPS = 3, 3
 """Rounds over the kinds of error, and steps to the variance in each."""
@@ -165,12 +173,12 @@ def _covariances(
     """Covariances of the unknowns without and with the correlation."""
     errors, rows, prior = whitened.errors, whitened.rows, np.diag(precision)
     inverse, before = whitened.covariances(precision)
-    spectra, belief = _models(len(errors), slow)
+    models = _models(len(errors), slow)
     waves = _cosine_transform(np.concatenate([rows, errors[..., None]], axis=2))
     middle = prior
-    for k, factor in enumerate(_factors(waves, spectra, belief, prior)):
+    for k, factor in enumerate(_factors(waves, models, prior)):
         along = waves[:, k, :-1]
-        middle = middle + whitened.variances[k] * (along.T * (factor @ spectra)) @ along
+        middle = middle + whitened.variances[k] * (along.T * (factor @ models.spectra)) @ along
     lower = _lower(before)
     inner = np.linalg.solve(lower, inverse @ middle @ inverse)
     values, vectors = np.linalg.eigh(np.linalg.solve(lower, inner.T))
@@ -189,62 +197,74 @@ def _cosine_transform(values: Float[np.ndarray, "n k q"]) -> Float[np.ndarray, "
     return found
 
 
-def _models(count: int, slow: float) -> tuple[Float[np.ndarray, "g n"], Float[np.ndarray, " g"]]:
-    """Variances of the cosine transform of errors with variance 1, and the prior of each model.
+@dataclass(frozen=True)
+class _Models:
+    """What is weighed: how the errors of one kind may be correlated.
 
-    ``slow`` is the share of the models of a slow path, from 0 to 1.
+    Attributes:
+        spectra: variances of the cosine transform of errors with variance 1.
+        belief: prior probabilities.
+        power: of the variance, by which the prior is divided.
     """
+
+    spectra: Float[np.ndarray, "g n"]
+    belief: Float[np.ndarray, " g"]
+    power: Float[np.ndarray, " g"]
+
+
+def _models(count: int, slow: float) -> _Models:
+    """Those for so many images; ``slow`` is the share of those of a slow path, from 0 to 1."""
     usual = (1 - slow) * (count >= FEWEST_SUCCESSIVE)
-    spectra, belief = [np.ones((1, count))], [np.array([1 - (1 - INDEPENDENT) * (usual + slow)])]
-    for share, make in ((usual, _usual_spectra), (slow, _slow_spectra)):
+    none = 1 - (1 - INDEPENDENT) * (usual + slow)
+    spectra, belief, power = [np.ones((1, count))], [none], [0.0]
+    for share, make, by in ((usual, _usual_spectra, 0.0), (slow, _slow_spectra, SIZE_POWER)):
         if share > 0:
             spectra.append(made := make(count))
-            belief.append(np.full(len(made), (1 - INDEPENDENT) * share / len(made)))
-    return np.concatenate(spectra), np.concatenate(belief)
+            belief += [(1 - INDEPENDENT) * share / len(made)] * len(made)
+            power += [by] * len(made)
+    return _Models(np.concatenate(spectra), np.array(belief), np.array(power))
 
 
 def _usual_spectra(count: int) -> Float[np.ndarray, "g n"]:
     """Of a correlation rho^|i - j|."""
-    return _partly(1 / _distance(CORRELATIONS, count))
+    rho = CORRELATIONS[:, None]
+    return _partly(1 / (1 + rho**2 - 2 * rho * np.cos(_frequencies(count))), SHARES)
 
 
 def _slow_spectra(count: int) -> Float[np.ndarray, "g n"]:
-    """Of the first and second order, by their autocorrelation times."""
-    time = np.geomspace(SHORTEST_TIME, LONGEST_TIMES * count, TIMES)
-    # By 1 - rho, the time of the second order, (1 + rho)^3 / ((1 - rho) (1 + rho^2)).
-    left = np.geomspace(1.0, 1e-7, 1000)
-    smooth = (2 - left) ** 3 / (left * (1 + (1 - left) ** 2))
-    second = 1 - np.exp(np.interp(np.log(time), np.log(smooth), np.log(left)))
-    first = (time - 1) / (time + 1)
-    found = 1 / _distance(first, count), 1 / _distance(second, count) ** 2
-    return np.concatenate([_partly(density) for density in found])
+    """Flat up to a cut-off, where they have fallen to half."""
+    periods = np.geomspace(SHORTEST_PERIOD, LONGEST_PERIODS * count, PERIODS)
+    cut_off = np.sin(np.pi / periods)[:, None] ** 2
+    above = np.sin(0.5 * _frequencies(count)) ** 2 / cut_off
+    # Of order 1 it is that of rho^|i - j|, of order m that of m such filters after one another.
+    densities = [(1 + (2 ** (1 / order) - 1) * above) ** -float(order) for order in ORDERS]
+    return _partly(np.concatenate(densities), SLOW_SHARES)
 
 
-def _distance(rho: Float[np.ndarray, " r"], count: int) -> Float[np.ndarray, "r n"]:
-    """|1 - rho exp(i w)|^2 at the frequencies w of the cosine transform."""
-    rho = rho[:, None]
-    return 1 - 2 * rho * np.cos(np.pi * np.arange(count) / count) + rho**2
+def _frequencies(count: int) -> Float[np.ndarray, " n"]:
+    """Those of the cosine transform, rad an image."""
+    return np.pi * np.arange(count) / count
 
 
-def _partly(density: Float[np.ndarray, "r n"]) -> Float[np.ndarray, "g n"]:
+def _partly(
+    density: Float[np.ndarray, "r n"], shares: Float[np.ndarray, " s"]
+) -> Float[np.ndarray, "g n"]:
     """Spectra of errors of which each of the shares is correlated so."""
-    share = SHARES[:, None]
+    share = shares[:, None]
     density = (density / density.mean(axis=-1, keepdims=True))[:, None]
     return (1 - share + share * density).reshape(-1, density.shape[-1])
 
 
 def _factors(
     waves: Float[np.ndarray, "n 3 q"],
-    spectra: Float[np.ndarray, "g n"],
-    belief: Float[np.ndarray, " g"],
+    models: _Models,
     prior: Float[np.ndarray, "p p"],
 ) -> Float[np.ndarray, "3 g"]:
-    """Weight of every spectrum times the variance under it, for every kind of error.
+    """Weight of every model times the variance under it, for every kind of error.
 
     Args:
         waves: cosine transforms of the unknowns' rows and, last, of the errors.
-        spectra: of all models of the correlation.
-        belief: their prior probabilities.
+        models: of the correlation.
         prior: (q - 1, q - 1) information about the unknowns.
 
     Returns:
@@ -252,9 +272,9 @@ def _factors(
         independence is certain.
     """
     count, kinds, size = waves.shape
-    weighed = np.array(
-        [[(wave.T / power) @ wave for power in spectra] for wave in waves.transpose(1, 0, 2)]
-    )
+    spectra = models.spectra
+    products = np.einsum("nkp,nkq->knpq", waves, waves).reshape(kinds, count, -1)
+    weighed = (1 / spectra @ products).reshape(kinds, len(spectra), size, size)
     whole = np.zeros((size, size))
     whole[:-1, :-1] = prior
     log_det = np.log(spectra).sum(axis=1)
@@ -278,8 +298,8 @@ def _factors(
                 continue
             cost = _restricted_cost(others + weighed[k] / variance[k][:, None, None])
             twice = cost + count * np.log(variance[k]) + log_det
-            twice += 2 * variance[k] / (PRIOR_VARIANCE * variance[k][0])
-            likelihood = belief * np.exp(-0.5 * (twice - twice.min()))
+            twice += 2 * models.power * np.log(np.maximum(variance[k] / variance[k][0], 1.0))
+            likelihood = models.belief * np.exp(-0.5 * (twice - twice.min()))
             weight[k] = likelihood / likelihood.sum()
     return weight * variance / variance[:, :1]
 
