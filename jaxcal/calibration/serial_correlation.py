@@ -71,12 +71,6 @@ SLOW_SHARES = 1 - np.array([0.5, 0.1, 0.01, 0.001, 1e-12])
 """Those along a slow path, where the fit absorbs most of the correlated part. (The last one is all,
 but for rounding.)"""
 
-SIZE_POWER = 0.4
-"""The prior of a model of a slow path is divided by this power of the variance, relative to that
-under independence. The fit absorbs nearly all of errors that last longer than the recording, so
-that they may have any size, and the mean of the variances would be that of the least likely model.
-"""
-
 INDEPENDENT = 0.5
 """Prior probability that errors of one kind are independent."""
 
@@ -88,6 +82,12 @@ ROUNDING_MM = 1e-9
 
 NEGLIGIBLE = 0.01
 """Errors with less than this share of the variance that they are given tell of no correlation."""
+
+PRIOR_VARIANCE, SIZE_POWER = 10_000.0, 1 / 3
+"""Mean of the exponential prior of a variance, relative to the one under independence; and by which
+power of it the prior of a model of a slow path falls. The fit absorbs nearly all of smooth errors
+that last longer than the recording, so that they may have any size, and the mean of the variances
+would be that of the least likely model."""
 
 ROUNDS, STEPS = 3, 3
 """Rounds over the kinds of error, and steps to the variance in each."""
@@ -298,7 +298,8 @@ def _factors(
                 continue
             cost = _restricted_cost(others + weighed[k] / variance[k][:, None, None])
             twice = cost + count * np.log(variance[k]) + log_det
-            twice += 2 * models.power * np.log(np.maximum(variance[k] / variance[k][0], 1.0))
+            size = variance[k] / variance[k][0]
+            twice += 2 * (size / PRIOR_VARIANCE + models.power * np.log(np.maximum(size, 1.0)))
             likelihood = models.belief * np.exp(-0.5 * (twice - twice.min()))
             weight[k] = likelihood / likelihood.sum()
     return weight * variance / variance[:, :1]
