@@ -14,19 +14,20 @@ A share a of the variance of each kind is correlated by rho^|i - j| between imag
 is independent. The residuals do not show C_k as it is, since the fit absorbs slow errors more than
 quick ones. So every pair (rho, a) of a grid is weighed by its restricted likelihood given those
 residuals (profiled over the variance), times a prior: half for no correlation, the other half
-spread evenly over the grid. The other kinds enter with their mean weights, in turn. C_k is then the
-weighed mean, which is the law of total variance, since every pair has the same estimate. So SDs
-grow by one to three percent where errors look independent and the poses change at random; nothing
-decides whether errors are correlated. The correction makes no answer more certain. The information
-P of priors on sound speed and delay is added to both sums.
+spread evenly over the grid, and less where the variance would be very large. The other kinds enter
+with their mean weights, in turn. C_k is then the weighed mean, which is the law of total variance,
+since every pair has the same estimate. So SDs grow by one to three percent where errors look
+independent and the poses change at random; nothing decides whether errors are correlated. The
+correction makes no answer more certain. The information P of priors on sound speed and delay is
+added to both sums.
 
 *Slow paths.* Where the probe was placed anew for every image, errors have little reason to stay
 alike for long. Where it moved slowly all the time, whatever depends on its motion did so, too, and
 few images along such a path cannot tell a drift from a movement. Offsets that follow the movement
 have no more quick changes than the movement itself, which no power of a frequency describes. Then
 the grid has spectra that are flat up to a cut-off and fall behind it, slowly or steeply, with
-periods at the cut-off up to several times the recording. Their prior falls with their variance. The
-share of this grid in the prior follows from the size of the steps (:func:`slowness`).
+periods at the cut-off up to twice the recording. The share of this grid in the prior follows from
+the size of the steps (:func:`slowness`).
 
 The cosine transform of a stationary series has nearly independent coefficients, whose variances are
 the spectral density. So no matrix of all images is formed: C_k is diagonal there.
@@ -38,7 +39,7 @@ series).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -57,9 +58,10 @@ SLOW_SHARE, RANDOM_SHARE = 0.2, 0.4
 """Steps between images, as shares of the distance of poses half a recording apart: up to the first
 one a path is slow, and from the second one on poses change at random."""
 
-PERIODS, SHORTEST_PERIOD, LONGEST_PERIODS = 10, 4.0, 5.0
+PERIODS, SHORTEST_PERIOD, LONGEST_PERIODS = 8, 4.0, 2.0
 """Along a slow path: number of periods at the cut-off that are weighed, the shortest one in images,
-and the longest one in numbers of all images."""
+and the longest one in numbers of all images, that of the slowest wave. (What does not change at all
+is the mean of the errors, whose doubt is included elsewhere.)"""
 
 ORDERS = (1, 4, 16)
 """Along a slow path: by which powers of the frequency, squared, the spectra fall behind it."""
@@ -83,11 +85,10 @@ ROUNDING_MM = 1e-9
 NEGLIGIBLE = 0.01
 """Errors with less than this share of the variance that they are given tell of no correlation."""
 
-PRIOR_VARIANCE, SIZE_POWER = 10_000.0, 1 / 3
-"""Mean of the exponential prior of a variance, relative to the one under independence; and by which
-power of it the prior of a model of a slow path falls. The fit absorbs nearly all of smooth errors
-that last longer than the recording, so that they may have any size, and the mean of the variances
-would be that of the least likely model."""
+PRIOR_VARIANCE = 10_000.0
+"""Mean of the exponential prior of a variance, relative to the one under independence. The fit
+absorbs nearly all of smooth errors that last longer than the recording, so that they may have any
+size, and the mean of the variances would be that of the least likely model."""
 
 ROUNDS, STEPS = 3, 3
 """Rounds over the kinds of error, and steps to the variance in each."""
@@ -173,12 +174,12 @@ def _covariances(
     """Covariances of the unknowns without and with the correlation."""
     errors, rows, prior = whitened.errors, whitened.rows, np.diag(precision)
     inverse, before = whitened.covariances(precision)
-    models = _models(len(errors), slow)
+    spectra, belief = _models(len(errors), slow)
     waves = _cosine_transform(np.concatenate([rows, errors[..., None]], axis=2))
     middle = prior
-    for k, factor in enumerate(_factors(waves, models, prior)):
+    for k, factor in enumerate(_factors(waves, spectra, belief, prior)):
         along = waves[:, k, :-1]
-        middle = middle + whitened.variances[k] * (along.T * (factor @ models.spectra)) @ along
+        middle = middle + whitened.variances[k] * (along.T * (factor @ spectra)) @ along
     lower = _lower(before)
     inner = np.linalg.solve(lower, inverse @ middle @ inverse)
     values, vectors = np.linalg.eigh(np.linalg.solve(lower, inner.T))
@@ -197,32 +198,18 @@ def _cosine_transform(values: Float[np.ndarray, "n k q"]) -> Float[np.ndarray, "
     return found
 
 
-@dataclass(frozen=True)
-class _Models:
-    """What is weighed: how the errors of one kind may be correlated.
+def _models(count: int, slow: float) -> tuple[Float[np.ndarray, "g n"], Float[np.ndarray, " g"]]:
+    """Variances of the cosine transform of errors with variance 1, and the prior of each model.
 
-    Attributes:
-        spectra: variances of the cosine transform of errors with variance 1.
-        belief: prior probabilities.
-        power: of the variance, by which the prior is divided.
+    ``slow`` is the share of the models of a slow path, from 0 to 1.
     """
-
-    spectra: Float[np.ndarray, "g n"]
-    belief: Float[np.ndarray, " g"]
-    power: Float[np.ndarray, " g"]
-
-
-def _models(count: int, slow: float) -> _Models:
-    """Those for so many images; ``slow`` is the share of those of a slow path, from 0 to 1."""
     usual = (1 - slow) * (count >= FEWEST_SUCCESSIVE)
-    none = 1 - (1 - INDEPENDENT) * (usual + slow)
-    spectra, belief, power = [np.ones((1, count))], [none], [0.0]
-    for share, make, by in ((usual, _usual_spectra, 0.0), (slow, _slow_spectra, SIZE_POWER)):
+    spectra, belief = [np.ones((1, count))], [np.array([1 - (1 - INDEPENDENT) * (usual + slow)])]
+    for share, make in ((usual, _usual_spectra), (slow, _slow_spectra)):
         if share > 0:
             spectra.append(made := make(count))
-            belief += [(1 - INDEPENDENT) * share / len(made)] * len(made)
-            power += [by] * len(made)
-    return _Models(np.concatenate(spectra), np.array(belief), np.array(power))
+            belief.append(np.full(len(made), (1 - INDEPENDENT) * share / len(made)))
+    return np.concatenate(spectra), np.concatenate(belief)
 
 
 def _usual_spectra(count: int) -> Float[np.ndarray, "g n"]:
@@ -257,14 +244,16 @@ def _partly(
 
 def _factors(
     waves: Float[np.ndarray, "n 3 q"],
-    models: _Models,
+    spectra: Float[np.ndarray, "g n"],
+    belief: Float[np.ndarray, " g"],
     prior: Float[np.ndarray, "p p"],
 ) -> Float[np.ndarray, "3 g"]:
     """Weight of every model times the variance under it, for every kind of error.
 
     Args:
         waves: cosine transforms of the unknowns' rows and, last, of the errors.
-        models: of the correlation.
+        spectra: of all models of the correlation.
+        belief: their prior probabilities.
         prior: (q - 1, q - 1) information about the unknowns.
 
     Returns:
@@ -272,7 +261,6 @@ def _factors(
         independence is certain.
     """
     count, kinds, size = waves.shape
-    spectra = models.spectra
     products = np.einsum("nkp,nkq->knpq", waves, waves).reshape(kinds, count, -1)
     weighed = (1 / spectra @ products).reshape(kinds, len(spectra), size, size)
     whole = np.zeros((size, size))
@@ -298,9 +286,8 @@ def _factors(
                 continue
             cost = _restricted_cost(others + weighed[k] / variance[k][:, None, None])
             twice = cost + count * np.log(variance[k]) + log_det
-            size = variance[k] / variance[k][0]
-            twice += 2 * (size / PRIOR_VARIANCE + models.power * np.log(np.maximum(size, 1.0)))
-            likelihood = models.belief * np.exp(-0.5 * (twice - twice.min()))
+            twice += 2 * variance[k] / (PRIOR_VARIANCE * variance[k][0])
+            likelihood = belief * np.exp(-0.5 * (twice - twice.min()))
             weight[k] = likelihood / likelihood.sum()
     return weight * variance / variance[:, :1]
 
