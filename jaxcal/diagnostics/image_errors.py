@@ -308,6 +308,15 @@ class Whitened:
             log_sd = log_sd + 0.5 * np.log(np.linalg.det(shape))
         return cls(errors, rows, offset, weight, response, log_sd)
 
+    def information(
+        self, kept: Float[Array, "k n"], precision: Float[Array, " p"]
+    ) -> Float[Array, "k p p"]:
+        """Of images with independent errors, with the precisions of the unknowns' priors."""
+        rows = flattened(self.rows * kept[..., None, None])
+        weighed = self.offset_response * (kept * self.offset_precision)[..., None]
+        taken = np.swapaxes(weighed, 1, 2) @ self.offset_response
+        return np.swapaxes(rows, 1, 2) @ rows - taken + np.diag(precision)
+
     def leverage(self, inverse: Float[Array, "k p p"]) -> Float[Array, "k n 3"]:
         """The share of each error's variance that the fit absorbs."""
         rows, own = self.rows, 0.0

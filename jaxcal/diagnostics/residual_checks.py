@@ -30,6 +30,7 @@ from jaxcal.diagnostics.image_errors import (
     Whitened,
     error_sd,
     flattened,
+    further_prior,
     motion,
     own_covariance,
     quadratic,
@@ -86,7 +87,9 @@ def inspect(
     residual = seen.errors
     if tuned:
         whitened = Whitened.of(answer, shifted)
-        left = np.maximum(1 - whitened.leverage(uncertainty.inverse), LEAST_ERROR_LEFT)
+        # The fit absorbs what it would of independent errors, however far it may be off by others.
+        inverse = inverses(whitened.information(kept, further_prior(answer)[0]), eps)
+        left = np.maximum(1 - whitened.leverage(inverse), LEAST_ERROR_LEFT)
         residual = whitened.errors / np.sqrt(left)
     kurtosis, misfit = check_noise_model(residual, seen.distance, kept)
     gain = gains(answer, seen, uncertainty)
