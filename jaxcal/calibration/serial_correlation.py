@@ -261,8 +261,12 @@ def _factors(
         independence is certain.
     """
     count, kinds, size = waves.shape
-    products = np.einsum("nkp,nkq->knpq", waves, waves).reshape(kinds, count, -1)
-    weighed = (1 / spectra @ products).reshape(kinds, len(spectra), size, size)
+    weighed = np.array(
+        [
+            1 / spectra @ (wave[:, :, None] * wave[:, None]).reshape(count, -1)
+            for wave in waves.transpose(1, 0, 2)
+        ]
+    ).reshape(kinds, len(spectra), size, size)
     whole = np.zeros((size, size))
     whole[:-1, :-1] = prior
     log_det = np.log(spectra).sum(axis=1)
