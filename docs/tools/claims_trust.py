@@ -235,18 +235,18 @@ def _good_and_outside() -> list[float]:
     outside = "verdict_good_outside_99"
     if any(_frames(outside, SAME, HOLDS)):
         raise ValueError("the page says that it is so with no held poses")
-    both = zip(_of_smooth(outside, SAME), _of_smooth("verdict_good", SAME), strict=True)
+    wrong, good = sum(_of_smooth(outside, SAME)), sum(_of_smooth("verdict_good", SAME))
     return [
-        *span(100 * one / other for one, other in both),
+        100 * wrong / good,
         *span(percent(_frames(outside, SAME, SWEEPS))),
     ]
 
 
 claim(
     VERDICT,
-    "Of the good verdicts that are left, {:.0f} to {:.0f} % have the truth outside. So do not "
-    "calibrate from one short, smooth sweep. In the longer sweeps of the first row the verdict is "
-    "good with the truth outside in {:.0f} to {:.0f} %,",
+    "Of all good verdicts there {:.0f} % have the truth outside. So do not calibrate from one "
+    "short, smooth sweep. In the longer sweeps of the first row the verdict is good with the truth "
+    "outside in {:.0f} to {:.0f} %,",
     _good_and_outside,
 )
 KEPT, ONE_OF_A_TIME = "2.5, at least 60", "1 of a time"
