@@ -6,11 +6,11 @@ offsets (and a part of the other errors) that change over about a second. Paths:
 0.3 s apart, of the same movement (or of one in random order), with offsets and errors that have a
 given correlation in successive frames. Smooth sweeps: 12 to 100 frames, 0.05 to 0.5 s apart, of a
 shorter and quieter movement (errors of 0.12 and 0.06 mm), with offsets as smooth as the movement
-itself, or drawn anew for each frame. Each trial is calibrated twice: with every frame as an image
-of its own (``jaxcal.calibrate_batch``), and by ``jaxcal.calibrate``, which takes one image for each
-different pose and, of a sweep, every so many (:mod:`jaxcal.calibration.dependence`), and widens the
-covariance for errors that are alike in successive images
-(:mod:`jaxcal.calibration.serial_correlation`).
+itself, or drawn anew for each frame; in the last ones tracked positions have an error, too. Each
+trial is calibrated twice: with every frame as an image of its own (``jaxcal.calibrate_batch``), and
+by ``jaxcal.calibrate``, which takes one image for each different pose and, of a sweep, every so
+many (:mod:`jaxcal.calibration.dependence`), and widens the covariance for errors that are alike in
+successive images (:mod:`jaxcal.calibration.serial_correlation`).
 
 The table has the coverage of the 95 % intervals of X's six parameters (the mean, the lowest and the
 highest), the root mean square errors of X and what was stated, and how many were refused for having
@@ -28,6 +28,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from functools import partial
 
 import numpy as np
 from common import arguments, batch_of, machine, right_errors, rms, show, write_rows
@@ -46,6 +47,8 @@ OFFSET_MM = 1.0
 """Offsets of holds are uniform within this."""
 QUIET_MM = np.array([0.12, 0.06])
 """The SDs in smooth sweeps."""
+TRACKER_MM = 0.1
+"""SD of tracked positions in the last smooth sweeps, each axis."""
 RATE_HZ = 20
 SAME = "calibrate, same trials"
 """In the table's second column: by ``jaxcal.calibrate``, of the trials of "every frame" only."""
@@ -148,13 +151,25 @@ def waves(time: np.ndarray, size: float, rng: np.random.Generator) -> np.ndarray
     return size * np.sin(2 * np.pi * time[:, None] / periods + phases) @ [0.7, 0.5]
 
 
-def smooth(count: int, step_s: float, rng: np.random.Generator, *, anew: bool = False) -> Frames:
-    """Frames of a moving probe whose offsets are as smooth as the movement, or drawn anew."""
+def smooth(
+    count: int,
+    step_s: float,
+    rng: np.random.Generator,
+    *,
+    anew: bool = False,
+    tracker_mm: float = 0.0,
+) -> Frames:
+    """Frames of a moving probe whose offsets are as smooth as the movement, or drawn anew.
+
+    Tracked positions are off by so many mm (SD, each axis).
+    """
     time = step_s * np.arange(count)
     rotations, q = moved(time, rng)
     q[:, 1] = 0.5 * rng.normal(size=count) if anew else waves(time, 0.8, rng)
     transform, poses = placed(q, rotations, rng)
-    return Frames(poses, seen(q) + QUIET_MM * rng.normal(size=(count, 2)), transform)
+    points = seen(q) + QUIET_MM * rng.normal(size=(count, 2))
+    poses[:, :3, 3] += tracker_mm * rng.normal(size=(count, 3))
+    return Frames(poses, points, transform)
 
 
 def seen(q: np.ndarray) -> np.ndarray:
@@ -198,6 +213,12 @@ CONDITIONS: dict[str, Callable[[np.random.Generator], Frames]] = {
     "sweep of 12, 0.5 s apart, offsets anew": lambda rng: smooth(12, 0.5, rng, anew=True),
     "sweep of 20, 0.5 s apart, offsets anew": lambda rng: smooth(20, 0.5, rng, anew=True),
     "sweep of 30, 0.5 s apart, offsets anew": lambda rng: smooth(30, 0.5, rng, anew=True),
+    **{
+        f"smooth sweep of {count}, {step_s:g} s apart, tracker {TRACKER_MM:g} mm": partial(
+            smooth, count, step_s, tracker_mm=TRACKER_MM
+        )
+        for count, step_s in ((20, 0.5), (30, 0.5), (100, 0.05), (100, 0.2))
+    },
 }
 
 

@@ -249,6 +249,25 @@ claim(
     "outside in {:.0f} to {:.0f} %,",
     _good_and_outside,
 )
+TRACKED = tuple(
+    f"smooth sweep of {count} s apart, tracker 0.1 mm"
+    for count in ("20, 0.5", "30, 0.5", "100, 0.05", "100, 0.2")
+)
+claim(
+    VERDICT,
+    "If tracked positions are off by 0.1 mm as well, intervals of such sweeps contain the truth in "
+    "{:.1f} to {:.1f} %, and the verdict is good with the truth outside in {:.0f} to {:.0f} % and "
+    "fair in {:.0f} to {:.0f} %",
+    lambda: [
+        value
+        for of, how in (
+            ("cover_95_mean", "calibrate"),
+            ("verdict_good_outside_99", SAME),
+            ("verdict_fair_outside_99", SAME),
+        )
+        for value in span(percent(_frames(of, how, TRACKED)))
+    ],
+)
 KEPT, ONE_OF_A_TIME = "2.5, at least 60", "1 of a time"
 
 

@@ -64,7 +64,7 @@ and the longest one in numbers of all images, that of the slowest wave. (What do
 is the mean of the errors, whose doubt is included elsewhere.)"""
 
 ORDERS = (1, 4, 16)
-"""Along a slow path: by which powers of the frequency, squared, the spectra fall behind it."""
+"""Along a slow path: powers of the squared frequency by which spectra fall behind the cut-off."""
 
 SHARES = np.array([1 / 3, 2 / 3, 1.0])
 """Shares of the variance that are correlated."""
