@@ -810,8 +810,10 @@ def test_apply_to_a_table(saved, tmp_path, capsys):
     lines = capsys.readouterr().out.splitlines()
     applied = random_transform().apply(np.array([[300, 12.5], [7.25, 40]]), pixel_sd_px=0.5)
     rows = np.array([[float(cell) for cell in line.split(",")] for line in lines[1:]])
-    np.testing.assert_allclose(rows[:, :3], applied.points, rtol=1e-15)
-    np.testing.assert_allclose(rows[:, 3] ** 2, applied.covariance[:, 0, 0])
+    sds = np.sqrt(np.diagonal(applied.covariance, axis1=1, axis2=2))
+    np.testing.assert_array_equal(rows[:, :6], np.hstack([applied.points, sds]).round(6))
+    upper = applied.covariance[:, [0, 0, 1], [1, 2, 2]]
+    np.testing.assert_allclose(rows[:, 6:], upper, rtol=5e-6)
     (tmp_path / "p.csv").write_text("lateral,range\n1,2\n")
     assert main(["apply", str(saved), str(tmp_path / "p.csv")]) == 2
     assert "the calibration takes pixels" in capsys.readouterr().err
@@ -888,7 +890,7 @@ def test_apply_refuses_poses_that_look_like_metres(saved, tmp_path, capsys):
     assert main(["apply", str(saved), str(table), "--pose-units", "m"]) == 0
     got = np.array([line.split(",")[:3] for line in capsys.readouterr().out.splitlines()[1:]])
     still = random_transform().apply(np.array([[300.0, 12.0]])).points
-    np.testing.assert_allclose(got.astype(float), still + 1e3 * places, atol=1e-9)
+    np.testing.assert_array_equal(got.astype(float), (still + 1e3 * places).round(6))
 
 
 def test_served_to_another_client():

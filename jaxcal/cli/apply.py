@@ -58,7 +58,7 @@ def apply(
     calibration (with estimated pixel sizes) and of --pixel-sd, but not those of the pose. Those of
     the calibration are what its covariance says, times the factor for few images that the TRE of
     its report has, too (variance_factor). If its verdict expects larger errors still, that factor
-    is printed on standard error. Masked images of a recording are left out; a last column, image,
+    is printed on standard error. Points and SDs are rounded to 1e-6 mm. Masked images of a recording are left out; a last column, image,
     has the numbers of the others. With --skip-invalid a last column, line, says which row is which.
     """
     import numpy as np
@@ -109,9 +109,14 @@ def apply(
     applied = transform.apply(points, poses, pixel_sd_px=pixel_sd)
     name, which = numbers or ("", [])
     rows: list[tuple[object, ...]] = [(*_COLUMNS, name) if which else _COLUMNS]
+    formats = (".6f",) * 6 + (".6g",) * 3
     for k, (point, covariance) in enumerate(zip(applied.points, applied.covariance, strict=True)):
         values = [*point, *np.sqrt(np.diag(covariance)), *covariance[[0, 0, 1], [1, 2, 2]]]
-        cells = [repr(float(value)) if np.isfinite(value) else "" for value in values]
+        # Where SDs are not known, cells are empty.
+        cells = [
+            f"{value:{form}}" if np.isfinite(value) else ""
+            for value, form in zip(values, formats, strict=True)
+        ]
         rows.append((*cells, which[k]) if which else tuple(cells))
     if out is None:
         click.echo(csv_text(rows), nl=False)
