@@ -244,11 +244,11 @@ def _linked(poses: Float[np.ndarray, "n 4 4"]) -> Int[np.ndarray, " n"]:
     label = np.arange(count)
     if count < 2:
         return label
-    first_axis, second_axis = _places(poses)[:2]
+    first_axis, second_axis = probe_points(poses)[:2]
     strip = np.floor(first_axis / limit)
     order = np.lexsort((second_axis, strip))
     poses, strip, second_axis = poses[order], strip[order], second_axis[order]
-    places = _places(poses).T
+    places = probe_points(poses).T
     # One number for strip and place in it; strips are farther apart than poses that may be near.
     wide = np.ptp(second_axis) + 2 * limit
     line = strip * wide + second_axis
@@ -342,7 +342,7 @@ def _pieces(poses: Float[np.ndarray, "m 4 4"]) -> Int[np.ndarray, " m"]:
     if displacement(poses, poses[:1]).max() <= HOLD_MM:
         return np.zeros(len(poses), int)
     count, limit = len(poses), 2 * SAME_POSE_MM
-    first, second = _places(poses)[:2]
+    first, second = probe_points(poses)[:2]
     order = np.argsort(first)
     starts, ends = np.searchsorted(first[order], [first - limit, first + limit])
     piece, least = np.arange(count), np.full(count, np.inf)
@@ -357,7 +357,7 @@ def _pieces(poses: Float[np.ndarray, "m 4 4"]) -> Int[np.ndarray, " m"]:
     return piece
 
 
-def _places(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "12 n"]:
+def probe_points(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "12 n"]:
     """Coordinates of four points of the probe, mm, those that vary most first.
 
     Between two poses none moves farther than twice their displacement.

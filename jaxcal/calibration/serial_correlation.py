@@ -24,10 +24,10 @@ added to both sums.
 *Slow paths.* Where the probe was placed anew for every image, errors have little reason to stay
 alike for long. Where it moved slowly all the time, whatever depends on its motion did so, too, and
 few images along such a path cannot tell a drift from a movement. Offsets that follow the movement
-have no more quick changes than the movement itself, which no power of a frequency describes. Then
-the grid has spectra that are flat up to a cut-off and fall behind it, slowly or steeply, with
-periods at the cut-off up to twice the recording. The share of this grid in the prior follows from
-the size of the steps (:func:`slowness`).
+change about as quickly as the probe does. So most of the grid has spectra that are flat up to a
+cut-off near the path's own frequency and fall steeply behind it. (A grid of all periods from a few
+images on gives most of the prior to errors that would be seen, and too little to those that the fit
+absorbs.) The share of this grid in the prior follows from the size of the steps (:func:`slowness`).
 
 The cosine transform of a stationary series has nearly independent coefficients, whose variances are
 the spectral density. So no matrix of all images is formed: C_k is diagonal there.
@@ -43,7 +43,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from jaxcal.calibration.dependence import step_share
+from jaxcal.calibration.dependence import probe_points, step_share
 from jaxcal.diagnostics.image_errors import further_prior
 from jaxcal.diagnostics.influence import WhitenedErrors, whitened_errors
 from jaxcal.model.unknowns import block_slice
@@ -58,19 +58,22 @@ SLOW_SHARE, RANDOM_SHARE = 0.2, 0.4
 """Steps between images, as shares of the distance of poses half a recording apart: up to the first
 one a path is slow, and from the second one on poses change at random."""
 
-PERIODS, SHORTEST_PERIOD, LONGEST_PERIODS = 8, 4.0, 2.0
-"""Along a slow path: number of periods at the cut-off that are weighed, the shortest one in images,
-and the longest one in numbers of all images, that of the slowest wave. (What does not change at all
-is the mean of the errors, whose doubt is included elsewhere.)"""
+FOLLOWING = 0.9
+"""Along a slow path: prior probability that errors that are alike follow the movement."""
 
-ORDERS = (1, 4, 16)
-"""Along a slow path: powers of the squared frequency by which spectra fall behind the cut-off."""
+PERIODS, LONGEST_PERIOD = (0.7, 1.0, 1.4, 2.0), 2.0
+"""Periods at the cut-off of errors that follow the movement, relative to its own, and the longest
+one relative to the number of images, that of the slowest wave. (What does not change at all is the
+mean of the errors, whose doubt is included elsewhere.)"""
+
+ORDER = 16
+"""Power of the squared frequency by which these spectra fall behind the cut-off."""
 
 SHARES = np.array([1 / 3, 2 / 3, 1.0])
 """Shares of the variance that are correlated."""
 
-SLOW_SHARES = 1 - np.array([0.5, 0.1, 0.01, 0.001, 1e-12])
-"""Those along a slow path, where the fit absorbs most of the correlated part. (The last one is all,
+FOLLOWING_SHARES = 1 - np.array([0.1, 0.03, 0.01, 0.003, 0.001, 1e-12])
+"""Those of errors that follow the movement, of which the fit absorbs most. (The last one is all,
 but for rounding.)"""
 
 INDEPENDENT = 0.5
@@ -116,14 +119,15 @@ def widened(result: Calibration) -> Calibration:
     if not np.isfinite(covariance).all():
         return result
     used = np.asarray(result.mask) > 0
-    slow = slowness(np.asarray(result.problem.poses, float)[used])
+    poses = np.asarray(result.problem.poses, float)[used]
+    slow = slowness(poses)
     if used.sum() < (FEWEST_SLOW if slow else FEWEST_SUCCESSIVE):
         return result
     if np.max(np.asarray(result.sigma)) < ROUNDING_MM:
         return result
     answer = batch_of_one(result)
     whitened = whitened_errors(answer)
-    before, after = _covariances(whitened, further_prior(answer)[0], slow)
+    before, after = _covariances(whitened, further_prior(answer)[0], poses)
     linearisation = result.linearisation
     # The information about all unknowns changes in the same proportion.
     variance = float(linearisation.variance)
@@ -168,13 +172,27 @@ def slowness(poses: Float[np.ndarray, "n 4 4"]) -> float:
     return float(np.interp(step_share(poses), [SLOW_SHARE, RANDOM_SHARE], [1.0, 0.0]))
 
 
+def movement_period(poses: Float[np.ndarray, "n 4 4"]) -> float:
+    """The period of a sine that changes as quickly as the probe moves, in images.
+
+    The mean square step of a sine with period P is 4 sin^2(pi / P) times its variance.
+
+    Args:
+        poses: of successive images, probe -> tracker, mm.
+    """
+    places = probe_points(poses)
+    variance = np.sum(np.var(places, axis=1))
+    step = np.mean(np.sum(np.diff(places, axis=1) ** 2, axis=0))
+    return float(np.pi / np.arcsin(np.sqrt(min(1.0, step / max(4 * variance, 1e-300)))))
+
+
 def _covariances(
-    whitened: WhitenedErrors, precision: Float[np.ndarray, " p"], slow: float
+    whitened: WhitenedErrors, precision: Float[np.ndarray, " p"], poses: Float[np.ndarray, "n 4 4"]
 ) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "p p"]]:
     """Covariances of the unknowns without and with the correlation."""
     errors, rows, prior = whitened.errors, whitened.rows, np.diag(precision)
     inverse, before = whitened.covariances(precision)
-    spectra, belief = _models(len(errors), slow)
+    spectra, belief = _models(poses)
     waves = _cosine_transform(np.concatenate([rows, errors[..., None]], axis=2))
     middle = prior
     for k, factor in enumerate(_factors(waves, spectra, belief, prior)):
@@ -198,34 +216,38 @@ def _cosine_transform(values: Float[np.ndarray, "n k q"]) -> Float[np.ndarray, "
     return found
 
 
-def _models(count: int, slow: float) -> tuple[Float[np.ndarray, "g n"], Float[np.ndarray, " g"]]:
-    """Variances of the cosine transform of errors with variance 1, and the prior of each model.
-
-    ``slow`` is the share of the models of a slow path, from 0 to 1.
-    """
-    usual = (1 - slow) * (count >= FEWEST_SUCCESSIVE)
-    spectra, belief = [np.ones((1, count))], [np.array([1 - (1 - INDEPENDENT) * (usual + slow)])]
-    for share, make in ((usual, _usual_spectra), (slow, _slow_spectra)):
+def _models(
+    poses: Float[np.ndarray, "n 4 4"],
+) -> tuple[Float[np.ndarray, "g n"], Float[np.ndarray, " g"]]:
+    """Variances of the cosine transform of errors with variance 1, and the prior of each model."""
+    count, slow = len(poses), slowness(poses)
+    following = FOLLOWING * slow
+    usual = slow - following + (1 - slow) * (count >= FEWEST_SUCCESSIVE)
+    alike = 1 - INDEPENDENT
+    spectra = [np.ones((1, count))]
+    belief = [np.array([1 - alike * (usual + following)])]
+    for share, make in ((usual, _usual_spectra), (following, _following_spectra)):
         if share > 0:
-            spectra.append(made := make(count))
-            belief.append(np.full(len(made), (1 - INDEPENDENT) * share / len(made)))
+            spectra.append(made := make(poses))
+            belief.append(np.full(len(made), alike * share / len(made)))
     return np.concatenate(spectra), np.concatenate(belief)
 
 
-def _usual_spectra(count: int) -> Float[np.ndarray, "g n"]:
+def _usual_spectra(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "g n"]:
     """Of a correlation rho^|i - j|."""
     rho = CORRELATIONS[:, None]
-    return _partly(1 / (1 + rho**2 - 2 * rho * np.cos(_frequencies(count))), SHARES)
+    return _partly(1 / (1 + rho**2 - 2 * rho * np.cos(_frequencies(len(poses)))), SHARES)
 
 
-def _slow_spectra(count: int) -> Float[np.ndarray, "g n"]:
+def _following_spectra(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "g n"]:
     """Flat up to a cut-off, where they have fallen to half."""
-    periods = np.geomspace(SHORTEST_PERIOD, LONGEST_PERIODS * count, PERIODS)
+    count = len(poses)
+    periods = np.minimum(movement_period(poses) * np.array(PERIODS), LONGEST_PERIOD * count)
     cut_off = np.sin(np.pi / periods)[:, None] ** 2
     above = np.sin(0.5 * _frequencies(count)) ** 2 / cut_off
-    # Of order 1 it is that of rho^|i - j|, of order m that of m such filters after one another.
-    densities = [(1 + (2 ** (1 / order) - 1) * above) ** -float(order) for order in ORDERS]
-    return _partly(np.concatenate(densities), SLOW_SHARES)
+    # Of order 1 it would be that of rho^|i - j|; this is that of so many filters one after another.
+    density = (1 + (2 ** (1 / ORDER) - 1) * above) ** -float(ORDER)
+    return _partly(density, FOLLOWING_SHARES)
 
 
 def _frequencies(count: int) -> Float[np.ndarray, " n"]:
