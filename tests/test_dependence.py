@@ -194,11 +194,10 @@ def whitened(errors: np.ndarray, rows: np.ndarray) -> WhitenedErrors:
     return WhitenedErrors(errors, rows, np.arange(3), 0 * every, every > 0, np.ones(3))
 
 
-def _linear_answers(order, correlation: float, share: float = 1.0, slow: float = 0.0):
+def _linear_answers(order, correlation: float, share: float = 1.0):
     """Errors of answers from 40 images on a slow path, in their SDs, and how these were widened.
 
     A share of the variance of every kind of error has this correlation in successive images.
-    ``slow`` is the share of models of a slow path.
     """
     rng, count = np.random.default_rng(7), 40
     errors, widening = [], []
@@ -212,7 +211,7 @@ def _linear_answers(order, correlation: float, share: float = 1.0, slow: float =
         drawn = np.sqrt(share) * drift + np.sqrt(1 - share) * own
         inverse = np.linalg.inv(np.einsum("mkp,mkq->pq", rows, rows))
         moved = inverse @ np.einsum("mkp,mk->p", rows, drawn)
-        before, after = _covariances(whitened(drawn - rows @ moved, rows), np.zeros(6), slow)
+        before, after = _covariances(whitened(drawn - rows @ moved, rows), np.zeros(6))
         np.testing.assert_allclose(before, inverse, rtol=1e-9)
         errors.append(moved / np.sqrt(np.diag(after)))
         widening.append(np.sqrt(np.diag(after) / np.diag(before)))
@@ -415,7 +414,7 @@ def test_alike_errors_leave_a_prior_as_it_is():
     rows[..., 4] = rows[..., 3]
     rows[1:] = 0.9 * rows[:-1].cumsum(axis=0) / np.arange(1, 40)[:, None, None] + 0.1 * rows[1:]
     slow = np.cumsum(rng.normal(size=(40, 3)), axis=0)
-    before, after = _covariances(whitened(slow, rows), np.array([0.0, 0.0, 0.0, 0.0, 1e-4]), 0.0)
+    before, after = _covariances(whitened(slow, rows), np.array([0.0, 0.0, 0.0, 0.0, 1e-4]))
     assert before[4, 4] == pytest.approx(1e4)
     assert after[4, 4] == pytest.approx(1e4)
     assert after[0, 0] > 1.5 * before[0, 0]

@@ -19,6 +19,7 @@ from golden import corpus
 from oracle import correlation, least_squares, model_average, uncertainty, variance
 from oracle.model import RIGID, Data, Unknowns, jacobian, points, size, target
 from scipy.integrate import quad
+from scipy.spatial.transform import Rotation
 
 import jaxcal
 
@@ -142,6 +143,19 @@ def test_the_oracle_imports_numpy_and_scipy_only():
             assert {name.split(".")[0] for name in names} <= allowed, path.name
 
 
+def conventional_covariances(
+    fit: least_squares.Fit, count: int, path: tuple[np.ndarray, np.ndarray] | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """For independent errors, and for errors that may be alike in successive images."""
+    spread = uncertainty.residual_variance(fit.cost, count, 9)
+    by_image, residual = fit.jacobian.reshape(count, 3, 9), fit.residual.reshape(-1, 3)
+    variances = uncertainty.axis_variances(by_image, residual, spread)
+    independent = uncertainty.covariance_by_axis(by_image, variances)
+    along, errors = by_image.swapaxes(0, 1) / np.sqrt(spread), residual.T / np.sqrt(spread)
+    wider = correlation.widened(independent, along, errors, variances / spread, path)
+    return independent, wider
+
+
 ORDINARY = [("points12", row) for row in (0, 1, 2, 3, 4, 5, 34, 42)] + [
     ("points24", row) for row in (6, 7, 8, 9)
 ]
@@ -152,11 +166,7 @@ def test_conventional(name, row):
     data = data_of(name, row)
     fit = conventional(name, row)
     spread = uncertainty.residual_variance(fit.cost, len(data), 9)
-    by_image, residual = fit.jacobian.reshape(len(data), 3, 9), fit.residual.reshape(-1, 3)
-    variances = uncertainty.axis_variances(by_image, residual, spread)
-    independent = uncertainty.covariance_by_axis(by_image, variances)
-    along, errors = by_image.swapaxes(0, 1) / np.sqrt(spread), residual.T / np.sqrt(spread)
-    wider = correlation.widened(independent, along, errors, variances / spread)
+    independent, wider = conventional_covariances(fit, len(data))
     for road, answer in answers(name, "conventional", row).items():
         covariance = wider if road == "one" else independent
         information = np.linalg.cholesky(spread * np.linalg.inv(covariance)).T
@@ -173,6 +183,34 @@ def test_conventional(name, row):
         )
         assert answer["condition"] == pytest.approx(seen.condition, rel=1e-6)
         assert answer["weakest_sd"] == pytest.approx(seen.weakest_sd, rel=1e-6)
+
+
+@pytest.mark.parametrize(("count", "step"), [(48, 0.7), (24, 1.5)])
+def test_the_covariance_along_a_slow_path(count, step):
+    """The second one is between slow and random."""
+    rng, time = np.random.default_rng(1), step * np.arange(count)
+    phases, periods = rng.uniform(0, 2 * np.pi, (7, 1)), rng.uniform(15, 40, (7, 1))
+    waves = np.sin(2 * np.pi * time / periods + phases)
+    rotation = Rotation.from_rotvec(0.4 * waves[:3].T).as_matrix()
+    q = np.stack([20 * waves[3], 0.8 * waves[4], 45 + 20 * waves[5]], axis=1)
+    x = np.array([[0.0, -1, 0, 10], [0, 0, -1, 20], [1, 0, 0, 30]])
+    origin = 50 - np.einsum("nij,nj->ni", rotation, q @ x[:, :3].T + x[:, 3])
+    measured = q[:, [0, 2]] + [0.3, 0.15] * rng.normal(size=(len(time), 2))
+    poses = np.tile(np.eye(4), (len(time), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = rotation, origin
+    fit = least_squares.conventional(Data(rotation, origin, measured, np.ones(2)), RIGID)
+    path = rotation, origin
+    assert 0.1 < correlation.slowness(*path)
+    assert (correlation.slowness(*path) < 1) == (count == 24)
+    independent, wider = conventional_covariances(fit, len(time), path)
+    result = jaxcal.calibrate(jaxcal.Problem.from_arrays(poses, measured), "conventional")
+    sd = np.sqrt(np.diag(wider)[:6])
+    assert (sd > 1.1 * np.sqrt(np.diag(independent)[:6])).any()
+    np.testing.assert_allclose(
+        np.asarray(result.covariance) / np.outer(sd, sd),
+        wider[:6, :6] / np.outer(sd, sd),
+        atol=AGREE,
+    )
 
 
 @pytest.mark.parametrize(

@@ -127,7 +127,7 @@ def widened(result: Calibration) -> Calibration:
         return result
     answer = batch_of_one(result)
     whitened = whitened_errors(answer)
-    before, after = _covariances(whitened, further_prior(answer)[0], poses)
+    before, after = _covariances(whitened, further_prior(answer)[0], slow, movement_period(poses))
     linearisation = result.linearisation
     # The information about all unknowns changes in the same proportion.
     variance = float(linearisation.variance)
@@ -187,12 +187,22 @@ def movement_period(poses: Float[np.ndarray, "n 4 4"]) -> float:
 
 
 def _covariances(
-    whitened: WhitenedErrors, precision: Float[np.ndarray, " p"], poses: Float[np.ndarray, "n 4 4"]
+    whitened: WhitenedErrors,
+    precision: Float[np.ndarray, " p"],
+    slow: float = 0.0,
+    period: float = np.inf,
 ) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "p p"]]:
-    """Covariances of the unknowns without and with the correlation."""
+    """Covariances of the unknowns without and with the correlation.
+
+    Args:
+        whitened: the errors and their rows.
+        precision: information of the unknowns' priors.
+        slow: :func:`slowness` of the path.
+        period: its :func:`movement_period`.
+    """
     errors, rows, prior = whitened.errors, whitened.rows, np.diag(precision)
     inverse, before = whitened.covariances(precision)
-    spectra, belief = _models(poses)
+    spectra, belief = _models(len(errors), slow, period)
     waves = _cosine_transform(np.concatenate([rows, errors[..., None]], axis=2))
     middle = prior
     for k, factor in enumerate(_factors(waves, spectra, belief, prior)):
@@ -217,32 +227,37 @@ def _cosine_transform(values: Float[np.ndarray, "n k q"]) -> Float[np.ndarray, "
 
 
 def _models(
-    poses: Float[np.ndarray, "n 4 4"],
+    count: int, slow: float, period: float
 ) -> tuple[Float[np.ndarray, "g n"], Float[np.ndarray, " g"]]:
     """Variances of the cosine transform of errors with variance 1, and the prior of each model."""
-    count, slow = len(poses), slowness(poses)
     following = FOLLOWING * slow
     usual = slow - following + (1 - slow) * (count >= FEWEST_SUCCESSIVE)
     alike = 1 - INDEPENDENT
     spectra = [np.ones((1, count))]
     belief = [np.array([1 - alike * (usual + following)])]
-    for share, make in ((usual, _usual_spectra), (following, _following_spectra)):
-        if share > 0:
-            spectra.append(made := make(poses))
-            belief.append(np.full(len(made), alike * share / len(made)))
+    if usual > 0:
+        spectra.append(_usual_spectra(count))
+        belief.append(_evenly(alike * usual, spectra[-1]))
+    if following > 0:
+        spectra.append(_following_spectra(count, period))
+        belief.append(_evenly(alike * following, spectra[-1]))
     return np.concatenate(spectra), np.concatenate(belief)
 
 
-def _usual_spectra(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "g n"]:
+def _evenly(belief: float, spectra: Float[np.ndarray, "g n"]) -> Float[np.ndarray, " g"]:
+    """A prior probability, spread evenly over models."""
+    return np.full(len(spectra), belief / len(spectra))
+
+
+def _usual_spectra(count: int) -> Float[np.ndarray, "g n"]:
     """Of a correlation rho^|i - j|."""
     rho = CORRELATIONS[:, None]
-    return _partly(1 / (1 + rho**2 - 2 * rho * np.cos(_frequencies(len(poses)))), SHARES)
+    return _partly(1 / (1 + rho**2 - 2 * rho * np.cos(_frequencies(count))), SHARES)
 
 
-def _following_spectra(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "g n"]:
+def _following_spectra(count: int, period: float) -> Float[np.ndarray, "g n"]:
     """Flat up to a cut-off, where they have fallen to half."""
-    count = len(poses)
-    periods = np.minimum(movement_period(poses) * np.array(PERIODS), LONGEST_PERIOD * count)
+    periods = np.minimum(period * np.array(PERIODS), LONGEST_PERIOD * count)
     cut_off = np.sin(np.pi / periods)[:, None] ** 2
     above = np.sin(0.5 * _frequencies(count)) ** 2 / cut_off
     # Of order 1 it would be that of rho^|i - j|; this is that of so many filters one after another.
