@@ -13,8 +13,10 @@ SAMPLE = (
     ("points12", "conventional", "batch"),
     ("points12", "auto", "one"),
     ("points12", "auto", "batch"),
+    ("points24", "conventional", "one"),
 )
-"""One shape; the default path of one problem and of a batch with what both begin with."""
+"""The default path of one problem and of a batch with what both begin with; and covariances that
+are widened for errors in successive images, for which the others have too few of them."""
 
 DEFAULT_OF_ALL = [
     pytest.param(name, call.name, "batch", marks=pytest.mark.slow)
