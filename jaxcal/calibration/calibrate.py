@@ -271,7 +271,7 @@ def calibrate_batch(
         robust: as for :func:`calibrate`; it takes longer than the solve.
         chunk: number of problems solved together; by default 32 on a processor (64 with priors
             ``auto`` and ``uniform``, 8 on channels), and on a GPU as many as have a million images
-            together.
+            (on channels, distances of elements) together.
 
     Returns:
         A :class:`Calibration` whose arrays have the problems' leading axes.

@@ -100,7 +100,7 @@ class Pivot(OneOrBatch, eqx.Module):
 
     @property
     def status(self) -> str | np.ndarray:
-        """converged, max_iterations, unobservable or failed; an array of these for a batch."""
+        """converged, unobservable or failed; an array of these for a batch."""
         return status_names(np.asarray(self.status_code))
 
     @property

@@ -109,8 +109,9 @@ def widened(result: Calibration) -> Calibration:
         result: of one problem, with concrete values.
 
     Returns:
-        Calibrations from channels, with bounded offsets or with too few images
-        (:data:`FEWEST_SUCCESSIVE`) are returned unchanged.
+        Calibrations from channels, with bounded offsets, too few images (:data:`FEWEST_SUCCESSIVE`;
+        :data:`FEWEST_SLOW` on slow paths), rounding errors alone or without a finite covariance are
+        returned unchanged.
     """
     if not widens(result.data == "channels", result.prior) or result.problem is None:
         return result

@@ -35,7 +35,8 @@ def images_to(
         The number of images; 0 if the error is reached already.
 
     Raises:
-        InputError: more than 1000 would be needed.
+        InputError: more than 1000 would be needed; a wanted error that is not positive; a
+            calibration without candidates.
     """
     if not (is_number(tre_mm) and tre_mm > 0):
         raise InputError(f"the wanted error must be a positive number of mm, not {tre_mm!r}")

@@ -356,14 +356,24 @@ class Calibration(OneOrBatch):
 
     @property
     def warnings(self) -> list[str]:
-        """What a person should know before using this answer, in words (one problem)."""
+        """What a person should know before using this answer, in words (one problem).
+
+        Raises:
+            CalibrationError: without its problem, or under a JAX transformation.
+            InputError: of a batch.
+        """
         from jaxcal.diagnostics.warnings import warnings
 
         return warnings(self.numpy())
 
     @property
     def observability(self) -> dict[str, float | str | None]:
-        """condition, weakest_direction (text), weakest_sd_mm, known_only_from_prior (text)."""
+        """condition, weakest_sd_mm; in words weakest_direction, known_only_from_prior, advice.
+
+        Raises:
+            CalibrationError: without its problem, or under a JAX transformation.
+            InputError: of a batch.
+        """
         from jaxcal.diagnostics.directions import observability
 
         return observability(self)
@@ -445,6 +455,7 @@ class Calibration(OneOrBatch):
             tre_points: further image points, in the images' unit, for which to give the error.
 
         Raises:
+            CalibrationError: without its problem, or under a JAX transformation.
             InputError: a batch, or points that are not pairs of numbers up to 1e7.
         """
         from jaxcal.report.in_memory import record_of
@@ -455,6 +466,7 @@ class Calibration(OneOrBatch):
         """How accurate the calibration is, what limits it and what to do, in sentences.
 
         Raises:
+            CalibrationError: without its problem, or under a JAX transformation.
             InputError: a batch.
         """
         from jaxcal.report.verdict import verdict
@@ -486,6 +498,7 @@ class Calibration(OneOrBatch):
         """Write one page for a browser, as ``jaxcal calibrate --report`` does.
 
         Raises:
+            CalibrationError: without its problem, or under a JAX transformation.
             InputError: the file exists and is no such page, or is not named .html.
             OutputError: it could not be written and is unchanged.
         """

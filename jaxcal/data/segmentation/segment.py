@@ -141,8 +141,9 @@ def segment(
 ) -> Segmentation:
     """Segment the target in every frame of times of flight.
 
-    No answer is NaN, or 0. If more than 8 elements have exactly the longest time of their frame, it
-    is taken for the end of the receiver's window, and they for elements without an answer.
+    No answer is NaN, or 0. If more than 8 elements have exactly the longest time of their frame,
+    and more than four times as many as have the next shorter one, it is taken for the end of the
+    receiver's window, and they for elements without an answer.
 
     Points of a curved array come from the in-plane fit, which is what an image would show. The
     array's own estimate of the elevation is so uncertain (y^2 has an SD of hundreds of mm^2 for a
@@ -359,8 +360,9 @@ def check_times_of_flight(
 def _end_of_window(times: Float[np.ndarray, "n elements"]) -> Bool[np.ndarray, "n elements"]:
     """Times that a receiver wrote where it heard nothing until the end of its window.
 
-    More than 8 elements of a frame have exactly its longest time. With a clock, the target's own
-    times are equal in runs; they change fastest far from the target, where the longest ones are.
+    More than 8 elements of a frame have exactly its longest time, and more than :data:`_TIES` times
+    as many as have the next shorter one. With a clock, the target's own times are equal in runs;
+    they change fastest far from the target, where the longest ones are.
     """
     answers = np.where(np.isfinite(times), times, -np.inf)
     longest = answers.max(axis=1, keepdims=True)
