@@ -181,6 +181,14 @@ def test_images_that_are_as_noisy_as_their_covariances_say_are_no_outliers():
     assert np.flatnonzero(np.asarray(found.outlier)).tolist() == [7]
 
 
+def test_given_sds_in_metres_are_told_even_of_few_images():
+    data = problem(5, images=6, elevation_mm=0.5, noise_mm=0.5)
+    result = jaxcal.calibrate(data, sigma=(0.2, 0.1, 0.5))
+    for unit, told in ((1.0, False), (1e-3, True)):
+        given = replace(result, sigma=unit * result.sigma)
+        assert ("are the SDs in mm?" in " ".join(given.warnings)) == told
+
+
 def test_complaints_are_warnings_in_words():
     data = problem(1, images=40, elevation_mm=1.0, noise_mm=0.5)
     result = jaxcal.calibrate(data, "conventional")

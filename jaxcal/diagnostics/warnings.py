@@ -11,7 +11,7 @@ from jaxcal.diagnostics.image_errors import KINDS
 from jaxcal.diagnostics.misfits import misfits
 from jaxcal.diagnostics.outliers import listed_outliers, outliers, suspects_in_words
 from jaxcal.diagnostics.tracker_distortion import too_short
-from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
+from jaxcal.model.thresholds import FALLBACK_SIGMA, MINIMUM_SELF_TUNING
 from jaxcal.model.unknowns import block_slice
 from jaxcal.result.calibration import Calibration, check_one
 from jaxcal.runtime.messages import enumerated
@@ -202,11 +202,13 @@ def _other_than_given(result: Calibration) -> list[str]:
     given, used = np.asarray(result.sigma, float), np.asarray(result.mask) > 0
     if result.prior not in TUNED or result.sigma_tuned or result.data != "points":
         return []
-    if used.sum() < MINIMUM_SELF_TUNING:
-        return []  # they are the default ones
+    few = used.sum() < MINIMUM_SELF_TUNING
+    if few and np.allclose(given, FALLBACK_SIGMA):
+        return []  # they were not given
     squares = np.mean(np.asarray(result.residual, float)[used] ** 2, axis=0)[[0, 2, 1]]
     ratio = float(np.max(np.sqrt(squares) / given))
-    if 1 / OTHER_THAN_GIVEN <= ratio <= OTHER_THAN_GIVEN:
+    # The fit of few images leaves little of their errors.
+    if (0 if few else 1 / OTHER_THAN_GIVEN) <= ratio <= OTHER_THAN_GIVEN:
         return []
     small = "small" if ratio > 1 else "large"
     return [

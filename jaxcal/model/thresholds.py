@@ -8,6 +8,9 @@ LARGEST_ELEVATION = 0.95
 MINIMUM_SELF_TUNING = 8
 """With fewer used images the residuals cannot determine three SDs besides nine unknowns."""
 
+FALLBACK_SIGMA = (0.5, 0.5, 1.0)
+"""SDs of lateral position, range and offset (mm), used where too few images determine them."""
+
 FEWEST_TO_LEAVE_OUT = 8
 """With fewer used images nothing is left out: they cannot outvote one another."""
 

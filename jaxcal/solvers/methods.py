@@ -28,6 +28,7 @@ from jaxcal.model.observations import (
     unit_shape,
     variance_planes,
 )
+from jaxcal.model.thresholds import FALLBACK_SIGMA
 from jaxcal.model.unknowns import TABLE, with_prior
 from jaxcal.solvers import implicit
 from jaxcal.solvers.alternating import Alternation, alternate, bounded
@@ -40,11 +41,8 @@ from jaxcal.solvers.reml import SelfTuned, on_floor, self_tuned
 from jaxcal.solvers.start import ConventionalStart, conventional
 from jaxcal.solvers.with_optimistix import Fit, minimise_with, self_tuned_with
 
-FALLBACK_SIGMA = (0.5, 0.5, 1.0)
-"""SDs of lateral position, range and offset (mm), used where too few images determine them."""
-
 FALLBACK_CHANNEL_SIGMA = (0.5, 1.0)
-"""SDs of an element's distance and of the offset (mm), used in the same case."""
+"""SDs of an element's distance and of the offset (mm), used in the case of ``FALLBACK_SIGMA``."""
 
 
 class Solution(eqx.Module):
