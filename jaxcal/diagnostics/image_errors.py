@@ -203,6 +203,10 @@ class ImageErrors:
         mean = float(np.asarray(answer.offset_law.mean)[0])
         return replace(self, errors=self.errors - mean * self.mask[..., None] * [0.0, 0.0, 1.0])
 
+    def in_plane(self, unknowns: slice | tuple[int, ...]) -> Float[Array, "n 3 _"]:
+        """Derivatives of one calibration's errors by some unknowns, 0 for elevational errors."""
+        return self.rows[0][..., unknowns] * [[1.0], [1.0], [0.0]]
+
     def lever(self, mask: Float[Array, "k n"]) -> Float[Array, " k"]:
         """Root mean square distance of the measured points from the image origin, mm."""
         squares = np.where(mask > 0, self.lateral**2 + self.distance**2, 0.0)

@@ -73,7 +73,7 @@ def by_target(seen: ImageErrors) -> Float[Array, "n 3 3"]:
 
     Those do not count: the placement of the target may change with the pose as well.
     """
-    return seen.rows[0][..., block_slice(seen.blocks, "point")] * [[1.0], [1.0], [0.0]]
+    return seen.in_plane(block_slice(seen.blocks, "point"))
 
 
 def orientations(poses: Float[Array, "n 4 4"], used: Bool[Array, " n"]) -> Float[Array, "n 3"]:
@@ -112,7 +112,7 @@ class RandomField(NamedTuple):
         """The field g, by which the image moves on the probe."""
         vectors = orientations(np.asarray(seen.problem.poses)[0], used)
         lever = float(seen.lever(seen.mask)[0])
-        within = seen.rows[0][..., WITHIN] * [[1.0], [1.0], [0.0]] / [1.0, 1.0, lever]
+        within = seen.in_plane(WITHIN) / [1.0, 1.0, lever]
         return cls(vectors, vectors, within)
 
     def columns(self) -> Float[Array, "n 3 k"]:

@@ -301,7 +301,7 @@ def _candidates(
     face = float(np.asarray(seen.problem.face_offset)[0])
     zero = np.zeros_like(distance)
     order = (np.cumsum(used) - 1) / (used.sum() - 1) - 0.5
-    within = seen.rows[0][..., WITHIN] * [[1.0], [1.0], [0.0]]
+    within = seen.in_plane(WITHIN)
     found = [
         Candidate("slip", order[:, None, None] * within),
         Candidate("beside", np.stack([zero, 0.5 / distance, zero], axis=-1)[..., None]),
@@ -326,11 +326,10 @@ def _candidates(
 
 def _steps(answer: Calibration, seen: ImageErrors, used: Bool[Array, " n"]) -> list[Candidate]:
     """A step of X and one of the target, in mm, each at its clearest place."""
-    of_x = seen.rows[0][..., WITHIN] * [[1.0], [1.0], [0.0]]
-    moved = dict(zip(_AT_ONCE, (of_x, tracker_distortion.by_target(seen)), strict=True))
+    moved = seen.in_plane(WITHIN), tracker_distortion.by_target(seen)
     images = np.flatnonzero(used)
     found: list[Candidate] = []
-    for kind, columns in moved.items():
+    for kind, columns in zip(_AT_ONCE, moved, strict=True):
         errors, rows = _in_sds(answer, seen, used, [columns])
         known, own = np.split(rows, [-columns.shape[-1]], axis=-1)
         before, _ = tuned(*shortened(errors, known), len(images))
@@ -355,7 +354,7 @@ def _lag(
     motion = np.hstack([v, omega @ transform[:3, :3]])
     if not motion.any():
         return []
-    rows = seen.rows[0][..., :6] * [[1.0], [1.0], [0.0]]
+    rows = seen.in_plane(slice(6))
     return [Candidate("lag", -np.einsum("nki,ni->nk", rows, motion)[..., None])]
 
 
@@ -485,20 +484,20 @@ def _fit_field(
 
     Also without any neighbourhood, and without the elevational errors.
     """
+    limit = _BY_CHANCE[kind]
     found = tracker_distortion.fit(errors, rows, start, coefficients)
-    if found is None or not found.statistic > _BY_CHANCE[kind]:
+    if found is not None and found.statistic > limit:
+        precision = np.zeros(rows.shape[-1])
+        precision[-coefficients:] = 1 / found.variance
+        rho = correlation(errors, rows, found.kinds, precision)
+        if rho.any():
+            errors, rows = independent(errors, rho), independent(rows, rho)
+            found = tracker_distortion.fit(errors, rows, start, coefficients)
+    if found is None or not found.statistic > limit:
         return None
-    precision = np.zeros(rows.shape[-1])
-    precision[-coefficients:] = 1 / found.variance
-    rho = correlation(errors, rows, found.kinds, precision)
-    if rho.any():
-        errors, rows = independent(errors, rho), independent(rows, rho)
-        found = tracker_distortion.fit(errors, rows, start, coefficients)
-        if found is None or not found.statistic > _BY_CHANCE[kind]:
-            return None
     parts = [np.s_[:, :2], *(~near for near in tracker_distortion.neighbourhoods(places))]
     for part in parts:
         rest = tracker_distortion.statistic(errors[part], rows[part], start, coefficients)
-        if not rest > _BY_CHANCE[kind] / 2:
+        if not rest > limit / 2:
             return None
     return found
