@@ -68,7 +68,7 @@ def allowed_by(limits: Limits, tcp_offset: tuple[float, ...] | None) -> Allowed:
         tcp_offset: m and rad; None: the arm's joints are not checked.
     """
     axis = np.asarray(limits.cone_axis) / np.linalg.norm(limits.cone_axis)
-    corners = np.array([limits.tip_mm, *limits.hull_mm])
+    corners = limits.probe_points
     # Room for the search along the elevational axis; mostly a few mm are enough.
     margin = min(limits.search_mm, _SEARCH_ROOM_MM)
     low, high = np.radians(limits.joint_min_deg), np.radians(limits.joint_max_deg)

@@ -42,7 +42,7 @@ from hw.recording.layout import (
     RecordingHeader,
 )
 from jaxcal import FormatError, OutputError, __version__
-from jaxcal.io.atomic import write_text
+from jaxcal.io.atomic import partial_path, write_text
 from jaxcal.io.given_files import one_line
 
 RESERVE_BYTES = 2**27
@@ -103,7 +103,7 @@ class RecordingWriter:
             OutputError: the file is there already, or cannot be written.
         """
         final = check_new(path)
-        temporary = final.parent / f".partial-{secrets.token_hex(8)}{final.suffix}"
+        temporary = partial_path(final)
         try:
             # Built in memory: HDF5 crashes on a full disk.
             image = io.BytesIO()
@@ -373,7 +373,7 @@ class RecordingWriter:
             self._forget()
 
     def _copied(self) -> Path:
-        temporary = self.path.parent / f".partial-{secrets.token_hex(8)}{self.path.suffix}"
+        temporary = partial_path(self.path)
         try:
             with open(temporary, "xb") as copy:
                 os.lseek(self._descriptor, 0, os.SEEK_SET)
@@ -567,7 +567,7 @@ def _salvaged(path: Path) -> Path | None:
         OutputError: it is open elsewhere, or the disk refused the copy.
     """
     final = Path(os.path.realpath(path))
-    temporary = final.parent / f".partial-{secrets.token_hex(8)}{final.suffix}"
+    temporary = partial_path(final)
     kept = final.with_name(f"{final.name}.damaged")
     if kept.exists():
         kept = final.with_name(f"{final.name}.{secrets.token_hex(4)}.damaged")

@@ -167,6 +167,11 @@ class Limits:
         if self.arm_model:
             object.__setattr__(self, "arm_model", model_named(self.arm_model).name)
 
+    @property
+    def probe_points(self) -> Float[np.ndarray, "n 3"]:
+        """The tip and the corners of the hull in the TCP's frame, mm."""
+        return np.array([self.tip_mm, *self.hull_mm])
+
     @classmethod
     def from_mapping(cls, values: Mapping[str, object]) -> Limits:
         """Limits from names and values.

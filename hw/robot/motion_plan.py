@@ -99,7 +99,7 @@ class MotionPlan:
 def plan_lines(plan: MotionPlan, *, tcp_offset_known: bool = True) -> list[str]:
     """The plan's limits as a person must see them before it is confirmed; one fact a line."""
     limits = plan.limits
-    hull = np.ptp(np.array([limits.tip_mm, *limits.hull_mm]), axis=0)
+    hull = np.ptp(limits.probe_points, axis=0)
     x, y, z, *turn = plan.tcp_offset
     offset = (
         f"TCP offset: {_vector(1000 * np.array([x, y, z]))} mm, turned by "

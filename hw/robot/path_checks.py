@@ -60,7 +60,7 @@ def _check_box_in_reach(plan: MotionPlan) -> None:
         return
     model, limits = plan.arm.model, plan.limits
     tool = 1000.0 * math.hypot(*plan.tcp_offset[:3])
-    tip = float(np.linalg.norm(_probe_points(limits), axis=1).max())
+    tip = float(np.linalg.norm(limits.probe_points, axis=1).max())
     reach = model.reach_mm + model.d1 + tool + tip
     furthest = max(map(abs, limits.box_min_mm + limits.box_max_mm))
     if furthest > reach:
@@ -92,7 +92,7 @@ def check_path(
     count = 2 + math.ceil(turn / _PATH_STEP_DEG)
     way = straight_way(start, goal, np.linspace(0.0, 1.0, count))
     spread = math.radians(turn) / (count - 1)
-    probe = _probe_points(limits)
+    probe = limits.probe_points
     names = ["the probe's tip"] + ["a corner of the probe"] * len(limits.hull_mm)
     _check_box(way, spread, probe, names, limits.box_min_mm, limits.box_max_mm, f"{what} takes", "")
     flange = inverse_poses(tool_of(plan.tcp_offset))[:3, 3]
@@ -141,14 +141,9 @@ def _check_box(
 
 def out_of_box_mm(pose: np.ndarray, limits: Limits) -> float:
     """By how much the probe at a pose is out of the box, mm; negative inside."""
-    points = _probe_points(limits) @ pose[:3, :3].T + pose[:3, 3]
+    points = limits.probe_points @ pose[:3, :3].T + pose[:3, 3]
     low, high = np.asarray(limits.box_min_mm), np.asarray(limits.box_max_mm)
     return float(np.maximum(low - points, points - high).max())
-
-
-def _probe_points(limits: Limits) -> np.ndarray:
-    """(n, 3) the tip and the corners of the hull in the TCP's frame, mm."""
-    return np.array([limits.tip_mm, *limits.hull_mm])
 
 
 def pace(

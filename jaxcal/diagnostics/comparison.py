@@ -28,12 +28,12 @@ import numpy as np
 
 from jaxcal import InputError
 from jaxcal.data.poses import rotation_angle
-from jaxcal.diagnostics.intervals import LEVEL, length_quantile, student_variance
+from jaxcal.diagnostics.intervals import LEVEL, check_level, length_quantile, student_variance
 from jaxcal.result.calibration import Calibration
 from jaxcal.result.transform import ImageTransform
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.arrays import outline
-from jaxcal.runtime.given_values import check_made, is_number
+from jaxcal.runtime.given_values import check_made
 
 _LEAST_SHARE = 1e-6
 """Least share of the mean square at which a direction of the errors counts."""
@@ -99,8 +99,7 @@ def compare_calibrations(
             :meth:`ImageTransform.apply` refuses.
         CalibrationError: under a JAX transformation.
     """
-    if not (is_number(level) and 0 < level < 1):
-        raise InputError(f"level must be between 0 and 1, not {level!r}")
+    check_level(level)
     first, second = _transform("first", first), _transform("second", second)
     if (first.scale_mm_per_px is None) != (second.scale_mm_per_px is None):
         without, other = first, second

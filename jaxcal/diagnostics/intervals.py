@@ -67,6 +67,12 @@ _LAST_STEP = 3e-6
 """A step of ln r^2 shorter than this is the last."""
 
 
+def check_level(level: float) -> None:
+    """Raise InputError for a probability that is not a number between 0 and 1."""
+    if not (is_number(level) and 0 < level < 1):
+        raise InputError(f"level must be between 0 and 1, not {level!r}")
+
+
 def _check(calibration: object) -> None:
     if not hasattr(calibration, "linearisation"):
         raise InputError(
@@ -77,7 +83,7 @@ def _check(calibration: object) -> None:
 
 @traceable
 def degrees_of_freedom(calibration: Calibration) -> Float[AnyArray, "*batch"]:
-    """Degrees of freedom of the noise's SDs (traceable); inf where SDs were given."""
+    """Degrees of freedom of the noise's SDs (traceable); inf where SDs were held fixed."""
     _check(calibration)
     xp = array_module(calibration)
     used = xp.sum(xp.asarray(calibration.mask) > 0, axis=-1)
@@ -112,7 +118,7 @@ def variance_factor(calibration: Calibration) -> Float[AnyArray, "*batch"]:
 
 
 def transform_intervals(
-    calibration: Calibration, level: float = 0.95
+    calibration: Calibration, level: float = LEVEL
 ) -> Float[np.ndarray, "*batch 6"]:
     """Half-widths of the intervals of X's six parameters, the right perturbation X Exp([v, omega]).
 
@@ -125,11 +131,10 @@ def transform_intervals(
         where X is not observable.
 
     Raises:
-        InputError: a level that is not between 0 and 1.
+        InputError: a level that is not between 0 and 1, or what is no result of a calibration.
         CalibrationError: under a JAX transformation.
     """
-    if not (is_number(level) and 0 < level < 1):
-        raise InputError(f"level must be between 0 and 1, not {level!r}")
+    check_level(level)
     _check(calibration)
     answer = calibration.numpy()
     left = np.asarray(degrees_of_freedom(answer), float)

@@ -292,9 +292,14 @@ def _existing_mode(final: Path) -> int | None:
     return stat.S_IMODE(status.st_mode) & 0o777
 
 
+def partial_path(final: Path) -> Path:
+    """A new name beside a file, for its content until it is whole."""
+    return final.parent / f".partial-{secrets.token_hex(8)}{final.suffix}"
+
+
 def _create_beside(final: Path, mode: int | None) -> Path:
     # Not mkstemp: its mode 0600 would stay after renaming, and to read the umask is to set it.
-    temporary = final.parent / f".partial-{secrets.token_hex(8)}{final.suffix}"
+    temporary = partial_path(final)
     created = 0o666 if mode is None else (mode & 0o666) | 0o600
     os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_RDWR, created))
     return temporary

@@ -28,7 +28,7 @@ def open_sequence(
     Raises:
         InputError: files that cannot be read or do not belong together; one line.
     """
-    if options.poses is None or kind_of(options.poses) != "table":
+    if not options.poses_in_table:
         refuse(options, ("quaternion", "skip_invalid"), "is for tables, but no table is read")
     sequence, tracking, notes = opened(source, options)
     if tracking is None:

@@ -80,8 +80,7 @@ def from_sequence(
     if most_lost:
         notes.insert(0, f"only {len(images)} of {given} {what} can be used: see below")
     # A table of poses does not name their frames.
-    named = options.poses is None or kind_of(options.poses) != "table"
-    frames = posed.frames if named else None
+    frames = None if options.poses_in_table else posed.frames
     recording = Recording(images, source=sequence.source, pose_frames=frames)
     return Imported(recording, notes, results, most_lost)
 
@@ -242,7 +241,7 @@ def _points(
             )
         return points_of_markups(source, sequence, options.points)
     table = read_rows(source, options, ignore_time=options.ignore_time)
-    if table.poses is None and (options.poses is None or kind_of(options.poses) != "table"):
+    if table.poses is None and not options.poses_in_table:
         refuse(options, ("quaternion",), "is for tables with poses, and none is read")
     return points_of_table(table, sequence, options.points)
 

@@ -81,6 +81,11 @@ class ImportOptions:
         """Whether frames do not have the poses that stand with them in their file."""
         return self.poses is not None or self.lag_s != 0
 
+    @property
+    def poses_in_table(self) -> bool:
+        """Whether the poses are in a table of their own, which does not name their frames."""
+        return self.poses is not None and kind_of(self.poses) == "table"
+
 
 _FLAGS = {"source": "--from", "target": "--to", "target_kind": "--target", "lag_s": "--lag"}
 """Options of the command line that have other names than those here."""
