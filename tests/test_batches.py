@@ -11,6 +11,7 @@ import pytest
 from conftest import compiled_programs, experiment, problem, select
 
 import jaxcal
+from jaxcal.calibration.calibrate import Request, prepare
 from jaxcal.calibration.resampling import relative_twist
 from jaxcal.runtime import compiler
 
@@ -46,6 +47,16 @@ def hard_problems() -> tuple[list[jaxcal.Problem], list[jaxcal.Problem]]:
     row.poses[2, 3, 0] = 1.0
     pixel.spacing[1] = -1.0
     return good, [good[0], rest, outlier, parallel, lost, half, mirrored, row, pixel]
+
+
+def test_bounds_of_a_batch_say_whether_they_are_of_problems_or_of_images():
+    data = jaxcal.stack([drawn(k) for k in range(IMAGES)])  # as many problems as images
+    bounds = np.linspace(0.5, 1.5, IMAGES)
+    with pytest.raises(jaxcal.InputError, match=r"shape \(11, 11\) or \(11, 1\), mm; its shape"):
+        jaxcal.calibrate_batch(data, prior="bounded", max_elevation=bounds)
+    request = Request(prior="bounded", max_elevation=bounds[:, None])
+    each = prepare(data, request)[0].max_elevation
+    np.testing.assert_array_equal(each, np.repeat(bounds[:, None], IMAGES, 1))
 
 
 LONG = [pytest.param(name, marks=pytest.mark.slow) for name in METHODS if name != "conventional"]

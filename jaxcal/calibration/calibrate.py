@@ -120,9 +120,9 @@ def calibrate(
             ``gaussian``: offsets and errors are Gaussian, with the SDs of ``sigma`` or, without it,
             estimated by REML. ``bounded``: |y_i| <= max_elevation with equal weights, the
             alternation's objective. With given ``sigma``, ``auto`` is ``gaussian``.
-        max_elevation: bound m on |y|, mm, one number or (n,); overrides the problem's own. Without
-            either bound, the alternation and ``bounded`` use 1 mm. ``auto`` and ``uniform``
-            truncate the distribution of each image's offset at the bound.
+        max_elevation: bound m on |y|, mm, one number or (n,), for a batch (*batch, n); overrides
+            the problem's own. Without either bound, the alternation and ``bounded`` use 1 mm.
+            ``auto`` and ``uniform`` truncate the distribution of each image's offset at the bound.
         sigma: given SDs of lateral position, range and elevational offset, mm; on channels, of an
             element's distance and the elevational offset.
         tracker_sd: isotropic SD of the tracked position, mm; only with a given ``sigma``.
@@ -260,7 +260,7 @@ def calibrate_batch(
             added to them.
         method: as for :func:`calibrate`.
         prior: as for :func:`calibrate`.
-        max_elevation: as for :func:`calibrate`.
+        max_elevation: as for :func:`calibrate`; (*batch, 1) gives each problem one bound.
         sigma: as for :func:`calibrate`.
         tracker_sd: as for :func:`calibrate`.
         estimate: as for :func:`calibrate`.
@@ -506,11 +506,13 @@ def _with_bound(problem: Problem, bound: AnyArray | None) -> Problem:
     if bound is None:
         return problem
     wanted = problem.mask.shape
-    try:
-        bound = array_module(bound).broadcast_to(bound, wanted)
-    except ValueError:
+    # Fewer axes than the problems would leave open whether they are problems or images.
+    fits = all(have in (1, want) for have, want in zip(bound.shape, wanted, strict=False))
+    if bound.ndim not in (0, len(wanted)) or not fits:
+        each = f"one for each of {wanted[-1]} images"
+        if problem.batch_shape:
+            each = f"an array of shape {wanted} or {(*problem.batch_shape, 1)}"
         raise InputError(
-            f"max_elevation must be one number, or one for each of {wanted[-1]} images, mm; its "
-            f"shape is {bound.shape}"
-        ) from None
-    return replace(problem, max_elevation=bound)
+            f"max_elevation must be one number, or {each}, mm; its shape is {bound.shape}"
+        )
+    return replace(problem, max_elevation=array_module(bound).broadcast_to(bound, wanted))
