@@ -171,6 +171,24 @@ def test_the_trace_is_one_value():
     assert float(ended.trace[0]) == float(ended.cost)
 
 
+def test_an_answer_does_not_change_with_the_callers_arrays():
+    exact = experiment(5, images=20).calibration
+    # JAX shares the memory of arrays that lie so.
+    memory = np.empty(exact.measurements.size + 8)
+    first = -memory.ctypes.data % 64 // 8
+    points = memory[first : first + exact.measurements.size].reshape(exact.measurements.shape)
+    points[:] = exact.measurements
+    images = replace(exact, measurements=points)
+    data = jaxcal.Problem.from_recording(images)
+    held = replace(data, measurements=np.array(data.measurements))
+    answers = [jaxcal.calibrate(given, METHOD) for given in (images, data, held)]
+    points[3] += 20.0
+    held.measurements[3] += 20.0
+    for answer in answers:
+        assert np.abs(answer.residual[3]).max() < 5.0
+        np.testing.assert_array_equal(answer.problem.measurements, exact.measurements)
+
+
 # Without JAX
 
 ALONE = """
@@ -184,6 +202,7 @@ said = [found.status, float(found.rms), found.warnings, found.observability["con
 read = [found.residual, found.outlier, found.elevation_sd, found.weakest, found.inspection.misfit]
 assert all(isinstance(each, np.ndarray) for each in read)
 assert isinstance(problem.poses, np.ndarray) and bool(found.converged)
+assert not found.image_to_probe.flags.writeable  # as a JAX array
 assert found.image_transform().apply(np.ones((1, 2))).points.shape == (1, 3)
 heavy = {"jax", "jaxlib", "equinox", "optimistix", "jaxtyping", "scipy.stats", "matplotlib"}
 heavy |= {"jaxcal.report.plots", "jaxcal.report.page"}

@@ -33,7 +33,14 @@ from jaxcal.model.unknowns import (
 )
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import AnyArray, Array
-from jaxcal.runtime.arrays import array_module, array_tree, is_traced, jax_in_use, static
+from jaxcal.runtime.arrays import (
+    array_module,
+    array_tree,
+    is_traced,
+    jax_in_use,
+    read_only,
+    static,
+)
 from jaxcal.runtime.given_values import check_flag, whole_number
 from jaxcal.runtime.jax_modes import (
     importing_jax,
@@ -199,6 +206,8 @@ def _calibrated(problem: Problem, request: Request) -> Calibration:
     # Under jit the answer is traced even if the problem is not.
     if inside_transformation(problem, given):
         return replace(_solve_alone(problem, given, plan), problem=problem)
+    # Diagnostics read the data later, when the caller may have written to their arrays.
+    problem = read_only(problem)
     widening = widens(plan.channels, plan.prior)
     joined, found = independent(problem, request.estimate, widened=widening)
     if found.images < MINIMUM_IMAGES:
@@ -223,7 +232,7 @@ def _solve_alone(problem: Problem, given: Given, plan: SolvePlan) -> Calibration
         from jaxcal.calibration.engine import as_jax_holds
 
         return as_jax_holds(found, problem)
-    return found
+    return read_only(found)
 
 
 @importing_jax

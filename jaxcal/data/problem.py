@@ -225,7 +225,8 @@ class Problem(OneOrBatch):
         put: Any = jax.device_put if jax is not None else lambda array: array
 
         def array(values: np.ndarray | float | None) -> Any:
-            return None if values is None else put(np.asarray(values, dtype=dtype))
+            # A copy: JAX's array would otherwise share the memory of the recording's.
+            return None if values is None else put(np.array(values, dtype=dtype))
 
         channels, warnings = None, ()
         raw = images.measurements if images.kind == "time_of_flight" else images.time_of_flight

@@ -26,6 +26,7 @@ from jaxcal.runtime.arrays import (
     is_traced,
     map_arrays,
     outline,
+    read_only,
     static,
 )
 from jaxcal.runtime.given_values import check_made
@@ -257,7 +258,7 @@ class Calibration(OneOrBatch):
         from jaxcal.diagnostics.diagnose import diagnose
 
         answer = self.numpy()
-        return diagnose(self) if answer is self else answer._diagnostics
+        return read_only(diagnose(self)) if answer is self else answer._diagnostics
 
     @property
     def elevation_sd(self) -> Float[np.ndarray, "*batch n"]:
