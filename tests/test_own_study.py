@@ -161,6 +161,12 @@ def test_a_chunk_of_other_arrays_is_not_written(squares, tmp_path, change, said)
     assert not list((tmp_path / "study" / "chunks").iterdir())
 
 
+def test_a_class_instead_of_a_study_is_refused(squares, tmp_path):
+    with pytest.raises(InputError, match="run_study takes a study, not <class"):
+        run_study(squares, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_study_that_could_not_be_resumed_is_not_begun(squares, tmp_path):
     kind = type("Forgetful", (squares,), {"from_canonical": classmethod(lambda kind, _: kind())})
     with pytest.raises(InputError, match="does not give back the study"):

@@ -100,7 +100,8 @@ def run_study(
         CalibrationError: the cluster was lost, or a chunk failed in another process, whose error is
             told; ``resume`` continues. In this process the chunk's own error is raised.
     """
-    if not isinstance(spec, Study):
+    # A class has the members, too.
+    if isinstance(spec, type) or not isinstance(spec, Study):
         raise InputError(
             f"run_study takes a study, not {shown(spec)}: jaxcal.study.load_spec(path) reads one"
         )
