@@ -15,6 +15,7 @@ from conftest import experiment
 
 import jaxcal
 from jaxcal.data.problem import as_problem
+from jaxcal.design import candidates_around, next_poses
 from jaxcal.report import plots
 from jaxcal.report.record import calibration_record
 from jaxcal.result.saved import load_calibration
@@ -161,6 +162,9 @@ def test_debuggers_and_lists_of_a_notebook_show_no_arrays(recording):
         "AppliedPoints(points=float64[20,3], covariance=float64[20,3,3])"
     )
     assert "points=float64[20,2]" in repr(jaxcal.compare_calibrations(result, result, points))
+    around = candidates_around(recording, result, count=30)
+    assert "Candidates(poses=float64[30,4,4]" in repr(around)
+    assert len(repr(next_poses(result, around, k=5))) < 2000
     shapes = jax.eval_shape(lambda each: each, (problem, result))
     traced = []
     jax.jit(lambda each: traced.append(repr(each)))(problem)

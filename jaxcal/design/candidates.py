@@ -21,6 +21,7 @@ from jaxcal.design.noise import Noise, check_result, used_images
 from jaxcal.result.calibration import Calibration
 from jaxcal.result.transform import ImageTransform
 from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.arrays import outline
 from jaxcal.runtime.given_values import LARGEST_SEED, check_made, whole_number
 
 COUNT = 5000
@@ -64,6 +65,8 @@ class Candidates:
     taken: Float[np.ndarray, "k 4 4"] | None = None
     used: np.ndarray | None = None
     _checked: bool = field(default=False, repr=False)
+
+    __repr__ = outline
 
     def __post_init__(self) -> None:
         if self._checked:

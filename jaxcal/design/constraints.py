@@ -24,6 +24,7 @@ from jaxcal import InputError
 from jaxcal.data.poses import rotations_from_vectors, targets_in_images
 from jaxcal.data.probe import CurvilinearProbe, Probe, check_probe
 from jaxcal.runtime.array_types import Bool, Float
+from jaxcal.runtime.arrays import outline
 from jaxcal.runtime.given_values import check_made, is_number, real_array
 from jaxcal.runtime.messages import shown
 
@@ -158,6 +159,8 @@ class Constraints:
     box_mm: Box | None = None
     reach_mm: tuple[float, float] | None = None
     allowed: Allowed | None = None
+
+    __repr__ = outline
 
     def __post_init__(self) -> None:
         for name, largest in (("cone_deg", 85.0), ("turn_deg", 180.0)):

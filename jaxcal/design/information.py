@@ -26,7 +26,7 @@ from jaxcal.diagnostics.image_errors import motion
 from jaxcal.model.unknowns import RIGID, TABLE, block_slice, count_unknowns
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Float
-from jaxcal.runtime.arrays import array_tree, is_traced, static
+from jaxcal.runtime.arrays import array_tree, is_traced, outline, static
 from jaxcal.runtime.given_values import check_flag, check_made, is_number, real_array
 
 BELIEVED_SD = {"translation": 50.0, "rotation": 0.5, "point": 50.0, "scale": 0.3}
@@ -51,6 +51,8 @@ class Known:
     information: Float[np.ndarray, "p p"]
     images: int = 0
     tuned: bool = False
+
+    __repr__ = outline
 
 
 @array_tree

@@ -24,6 +24,7 @@ from jaxcal.diagnostics.directions import direction_in_words
 from jaxcal.diagnostics.uncertainty import mm_at_target, nearest_unknown
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Bool, Float
+from jaxcal.runtime.arrays import outline
 from jaxcal.runtime.given_values import check_flag, check_made, real_array, whole_number
 from jaxcal.runtime.messages import enumerated
 
@@ -60,6 +61,8 @@ class Plan:
     tre_mm: Float[np.ndarray, " n1"]
     rp_mm: Float[np.ndarray, " n1"]
     rules: Rules
+
+    __repr__ = outline
 
     def __len__(self) -> int:
         return len(self.poses)

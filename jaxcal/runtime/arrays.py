@@ -124,7 +124,7 @@ def outline(self: Any) -> str:
             return repr(value)
         return f"{value.dtype}[{','.join(map(str, value.shape))}]"
 
-    names = (field.name for field in dataclasses.fields(self))
+    names = (field.name for field in dataclasses.fields(self) if field.repr)
     told = ", ".join(f"{name}={short(getattr(self, name))}" for name in names)
     return f"{type(self).__name__}({told})"
 
