@@ -40,6 +40,14 @@ def test_draws_do_not_depend_on_the_batch():
     np.testing.assert_allclose(whole.points[3], part.points, rtol=0, atol=1e-6)
 
 
+def test_experiments_with_a_leading_axis_become_a_batch_of_problems():
+    protocol = replace(SMALL, raw=True)
+    drawn = jax.jit(jax.vmap(lambda key: simulate(key, protocol)))(jax.random.split(ROOT, 3))
+    batch = drawn.problem(max_elevation=2.0, probe=protocol.probe)
+    each = jax.vmap(lambda one: one.problem(max_elevation=2.0, probe=protocol.probe))(drawn)
+    jax.tree.map(np.testing.assert_array_equal, batch, each)
+
+
 def test_a_call_with_values_is_one_program_for_all_keys_and_sizes():
     """It ran step by step: 279 programs for the first call, and one more for each other call."""
     first, second = jax.random.split(ROOT)

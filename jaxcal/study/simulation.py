@@ -159,26 +159,32 @@ class Experiment(eqx.Module):
     def problem(self, max_elevation: float | None = None, probe: Probe | None = None) -> Problem:
         """The calibration images as a :class:`Problem` (traceable; without covariances).
 
+        Experiments with leading axes, as ``jax.vmap`` makes them, become a batch of problems.
+
         Args:
             max_elevation: bound on the offsets, mm.
             probe: the protocol's, where the distances are to be handed over beside the points.
         """
-        mask = jnp.ones(self.points.shape[0], self.points.dtype)
-        channels = None
+        mask = jnp.ones(self.points.shape[:-1], self.points.dtype)
+        batch, channels, speed, delay = mask.shape[:-1], None, None, None
+        if probe is not None:
+            speed = jnp.full(batch, probe.sound_speed_m_s, mask.dtype)
+            delay = jnp.full(batch, probe.delay_s, mask.dtype)
         if probe is not None and self.distances is not None:
             heard = (self.distances > 0).astype(mask.dtype)
-            positions = jnp.asarray(probe.element_positions(), mask.dtype)
+            elements = jnp.asarray(probe.element_positions(), mask.dtype)
+            positions = jnp.broadcast_to(elements, (*batch, *elements.shape))
             channels = Channels(heard * self.distances, heard, positions)
         return Problem(
             channels=channels,
-            sound_speed=None if probe is None else jnp.asarray(probe.sound_speed_m_s, mask.dtype),
-            delay=None if probe is None else jnp.asarray(probe.delay_s, mask.dtype),
+            sound_speed=speed,
+            delay=delay,
             curved=isinstance(probe, CurvilinearProbe),
             poses=self.poses,
             measurements=self.points,
             mask=mask,
-            spacing=jnp.ones(2, mask.dtype),
-            face_offset=jnp.zeros((), mask.dtype),
+            spacing=jnp.ones((*batch, 2), mask.dtype),
+            face_offset=jnp.zeros(batch, mask.dtype),
             max_elevation=None if max_elevation is None else max_elevation * mask,
         )
 
