@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import pickle
 import re
 import subprocess
 import sys
@@ -135,6 +136,19 @@ def test_answers_do_not_depend_on_the_callers_bits():
     assert rounded.image_to_probe.dtype == np.float64
     np.testing.assert_array_equal(narrow.image_to_probe, wide.image_to_probe)
     np.testing.assert_allclose(rounded.image_to_probe, wide.image_to_probe, atol=1e-3)
+
+
+def test_a_pickle_keeps_64_bits_where_jax_has_32():
+    with jax.enable_x64(True):
+        result = jaxcal.calibrate(experiment(3, images=12), "conventional")
+        assert isinstance(result.image_to_probe, jax.Array)
+        held = pickle.dumps(result)
+    with jax.enable_x64(False):
+        again = pickle.loads(held)
+    pairs = zip(jax.tree.leaves(result), jax.tree.leaves(again), strict=True)
+    for before, after in pairs:
+        assert after.dtype == before.dtype
+        np.testing.assert_array_equal(after, np.asarray(before))
 
 
 def test_a_float64_problem_inside_a_transformation_without_64_bits_gets_one_clear_line():

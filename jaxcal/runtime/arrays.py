@@ -111,8 +111,20 @@ def array_tree(kind: type[T]) -> type[T]:
     kind = dataclasses.dataclass(frozen=True, eq=False, repr=False)(kind)
     if "__repr__" not in vars(kind):
         kind.__repr__ = outline  # pyright: ignore[reportAttributeAccessIssue]
+    kind.__getstate__ = _state
     when_jax_is_imported(partial(_register, kind))
     return kind
+
+
+def _state(self: Any) -> dict[str, Any]:
+    """What a pickle holds: numpy's arrays, as JAX's would be cut to 32 bits where that is all."""
+    jax = imported("jax")
+
+    def kept(value: Any) -> Any:
+        held = jax is not None and isinstance(value, jax.Array) and not is_traced(value)
+        return np.asarray(value) if held else value
+
+    return {name: kept(value) for name, value in vars(self).items()}
 
 
 def outline(self: Any) -> str:
