@@ -13,7 +13,7 @@ from jaxcal.io import lines as text_files
 from jaxcal.io import table
 from jaxcal.io.importing.files import import_files
 from jaxcal.io.importing.frame_poses import tool_poses
-from jaxcal.io.importing.sources import ImportOptions
+from jaxcal.io.importing.sources import ImportOptions, kind_of
 from jaxcal.io.slicer import read_markups
 from jaxcal.io.text import read_crosswire, read_pose_table, recording_of
 from jaxcal.io.trackers import read_tracker
@@ -355,6 +355,15 @@ def test_csv_that_is_not_text(tmp_path, content):
     path.write_bytes(content)
     with pytest.raises(FormatError, match=r"table\.csv:[12]: is not text"):
         read_csv(path)
+
+
+def test_the_kind_of_a_file_is_told_from_its_first_line(tmp_path):
+    """Not from all of a large file: a damaged place far behind is not even looked at."""
+    path = tmp_path / "table.csv"
+    path.write_bytes(b"u,v\n" + b"1,2\n" * 100_000 + b"1,\xff\n")
+    assert (kind_of(path), table.first_line(path)) == ("table", (",", True))
+    with pytest.raises(FormatError, match=r"table\.csv:100002: is not text in UTF-8"):
+        read_pose_table(path)
 
 
 def test_controls_in_a_slip_are_escaped(tmp_path):

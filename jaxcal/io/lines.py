@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import csv
-import io
 import os
 import re
 from collections.abc import Iterator
 
 from jaxcal import FormatError
-from jaxcal.io.given_files import read_bytes
+from jaxcal.io.given_files import check_readable, one_line, read_bytes
 
 # Spreadsheets' errors, in English and German, are #N/A, #NV and words like #NAME? and #DIV/0!.
 _COMMENT = re.compile(r"\s*#(?!(?:N/A|NV|[A-Z/0]+[!?])[,;\t])")
@@ -37,24 +36,37 @@ def text_lines(
             characters; one line with path and line.
     """
     name = os.fspath(path)
-    content = read_bytes(path, MAXIMUM_BYTES)
-    if content.startswith(HDF5_BEGINNING):
-        raise FormatError(f"{name}: is HDF5, not text (a recording's name ends in .h5)")
+    check_readable(path, maximum_bytes=MAXIMUM_BYTES)
     try:
-        text = content.decode("utf-8-sig")
+        # Line by line: often only the first one is looked at.
+        with open(path, encoding="utf-8-sig") as file:
+            lines = iter(lambda: file.readline(LONGEST_LINE + 1), "")
+            for number, line in enumerate(lines, start=1):
+                if "\0" in line:
+                    raise FormatError(
+                        f"{name}:{number}: is not text in UTF-8: it holds a zero byte"
+                    )
+                if len(line) > LONGEST_LINE:
+                    raise FormatError(f"{name}:{number}: is longer than {LONGEST_LINE} characters")
+                if line.strip() and (comments or not _COMMENT.match(line)):
+                    yield number, line.rstrip("\n")
+    except UnicodeDecodeError:
+        raise _not_text(path) from None
+    except OSError as error:
+        raise FormatError(f"{name}: cannot be read: {one_line(error)}") from None
+
+
+def _not_text(path: str | os.PathLike[str]) -> FormatError:
+    """What to say of a file that is not text in UTF-8."""
+    name, content = os.fspath(path), read_bytes(path, MAXIMUM_BYTES)
+    if content.startswith(HDF5_BEGINNING):
+        return FormatError(f"{name}: is HDF5, not text (a recording's name ends in .h5)")
+    line = 1
+    try:
+        content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        line = content.count(b"\n", 0, error.start) + 1
-        raise FormatError(f"{name}:{line}: is not text in UTF-8: save it as UTF-8") from None
-    if "\0" in text:
-        line = text.count("\n", 0, text.index("\0")) + 1
-        raise FormatError(f"{name}:{line}: is not text in UTF-8: it holds a zero byte")
-    del content
-    # Not splitlines: it also breaks at form feeds and the like, where editors count no new line.
-    for number, line in enumerate(io.StringIO(text, newline=None), start=1):
-        if len(line) > LONGEST_LINE:
-            raise FormatError(f"{name}:{number}: is longer than {LONGEST_LINE} characters")
-        if line.strip() and (comments or not _COMMENT.match(line)):
-            yield number, line.rstrip("\n")
+        line += content.count(b"\n", 0, error.start)
+    return FormatError(f"{name}:{line}: is not text in UTF-8: save it as UTF-8")
 
 
 def cells_of(where: str, content: str, separator: str = ",") -> list[str]:
