@@ -391,6 +391,43 @@ def test_two_tables_of_images_by_name(tmp_path):
     assert not imported.most_lost
 
 
+@pytest.mark.parametrize(("of_poses", "of_points", "lost"), [(0, 1, 5), (1, 0, 0), (0, 0, None)])
+def test_images_counted_from_1_in_one_of_two_tables_are_told(tmp_path, of_poses, of_points, lost):
+    """All points but one had the pose of another image, and only the one left out was told."""
+    numbers = np.arange(6)
+    poses = [numbers + of_poses, *np.column_stack(POSE_COLUMNS).T]
+    (tmp_path / "poses.csv").write_text(_named(["frame", *POSE_NAMES], poses))
+    points = [numbers + of_points, *PIXELS.T]
+    (tmp_path / "p.csv").write_text(_named(["frame", "u", "v"], points))
+    notes = import_files([tmp_path / "poses.csv", tmp_path / "p.csv"]).notes
+    assert len(notes) == (lost is not None)
+    for note in notes:
+        assert note.startswith("1 point left out: ")
+        assert f"numbers begin with {of_points} in {tmp_path}/p.csv, with {of_poses} in" in note
+    # The pose of image 0 alone is missing: shifted numbers would leave a point out as well.
+    (tmp_path / "poses.csv").write_text(_named(["frame", *POSE_NAMES], [c[1:] for c in poses]))
+    (tmp_path / "p.csv").write_text(_named(["frame", "u", "v"], [numbers, *PIXELS.T]))
+    notes = import_files([tmp_path / "poses.csv", tmp_path / "p.csv"]).notes
+    assert not [note for note in notes if "begin with" in note]
+
+
+@pytest.mark.parametrize(
+    ("unit", "interval", "told"), [("", 20.0, 1), (" [ms]", 20.0, 0), ("", 0.02, 0)]
+)
+def test_times_in_ms_in_both_of_two_tables_are_told(tmp_path, unit, interval, told):
+    """A lag in s was a thousand times too short, and another lag was not noticed."""
+    times = interval * np.arange(6)
+    poses = [times, *np.column_stack(POSE_COLUMNS).T]
+    (tmp_path / "poses.csv").write_text(_named([f"time{unit}", *POSE_NAMES], poses))
+    (tmp_path / "p.csv").write_text(_named([f"time{unit}", "u", "v"], [times, *PIXELS.T]))
+    files = [tmp_path / "poses.csv", tmp_path / "p.csv"]
+    notes = import_files(files).notes
+    asked = [note for note in notes if "are 20 s apart if times are in s" in note]
+    assert len(asked) == told
+    with pytest.raises(InputError, match="are they in ms" if told else "too few images"):
+        import_files(files, ImportOptions(lag_s="auto"))
+
+
 def test_a_table_with_both_is_no_one_of_two_tables(tmp_path):
     """It ended in an error of numpy."""
     poses = [np.arange(6), *np.column_stack(POSE_COLUMNS).T]

@@ -22,6 +22,10 @@ from jaxcal.io.text import PoseTable
 from jaxcal.runtime.array_types import Bool, Float
 from jaxcal.runtime.messages import counted
 
+_SLOW_S = 1.0
+"""Poses at least so far apart make one ask for the unit of times: trackers are faster, and one of
+1 kHz has this interval if its ms are taken for s."""
+
 
 def one_of_two_tables(
     first: PoseTable, second: PoseTable, *, lag_s: float | Literal["auto"] = 0.0
@@ -82,6 +86,8 @@ def _poses_of(
             rows = np.array([places.get(image, -1) for image in _rows_by_image(points, wanted)])
             lost = counted(int((rows < 0).sum()), "point")
             said = [f"{lost} left out: {poses.name} has no pose of that image"]
+            if wanted is points.frame:
+                said[0] += _counted_otherwise(poses, points)
             _refuse_lag(lag_s)
             return poses.poses[rows], rows >= 0, None, said * bool((rows < 0).any())
     if poses.time is not None and points.time is not None:
@@ -91,6 +97,9 @@ def _poses_of(
         )
         tracking = tracking_of_table(poses, images)
         track = PoseTrack.of(tracking)
+        doubt = _unit_in_doubt(poses, points, track)
+        if lag_s == "auto" and doubt:
+            raise InputError(f"--lag auto: {doubt[0]}")
         if lag_s == "auto":
             lag_s, told = lag_of_points(points.time, points.points, track)
             notes = [told]
@@ -98,7 +107,7 @@ def _poses_of(
             notes = better_lag(points.time, points.points, track, lag_s)
         images, said = with_poses_by_time(images, tracking, lag_s)
         (found,), (valid,) = images.transforms.values(), images.valid.values()
-        return found, valid, track.velocities(points.time - lag_s), said + notes
+        return found, valid, track.velocities(points.time - lag_s), said + notes + doubt
     _refuse_lag(lag_s)
     unnamed = points.file is None and points.frame is None and points.time is None
     if unnamed and len(poses) == len(points):
@@ -107,6 +116,31 @@ def _poses_of(
         f"{points.name}: which pose of {poses.name} belongs to which point? Give both tables a "
         "column frame, file or time (without one, as many poses as points, in the same order)"
     )
+
+
+def _counted_otherwise(poses: PoseTable, points: PoseTable) -> str:
+    """A hint if one table seems to number the images from 0 and the other one from 1."""
+    assert poses.frame is not None
+    assert points.frame is not None
+    first, other = int(points.frame.min()), int(poses.frame.min())
+    found, if_alike = (np.isin(points.frame - by, poses.frame).sum() for by in (0, first - other))
+    if {first, other} != {0, 1} or if_alike <= found:
+        return ""
+    return (
+        f" (numbers begin with {first} in {points.name}, with {other} in {poses.name}: are images "
+        "counted from 0 in one and from 1 in the other? Then all points have a wrong pose)"
+    )
+
+
+def _unit_in_doubt(poses: PoseTable, points: PoseTable, track: PoseTrack) -> list[str]:
+    """A note if times may be in ms in both tables, so that a lag, which is in s, is another one."""
+    if poses.time_stated or points.time_stated or track.interval_s < _SLOW_S:
+        return []
+    return [
+        f"poses of {poses.name} are {track.interval_s:.3g} s apart if times are in s (no header "
+        "states their unit): are they in ms, us or ns? Name the columns time [ms], [us], [ns] or "
+        "[s]"
+    ]
 
 
 def _refuse_lag(lag_s: float | Literal["auto"]) -> None:
