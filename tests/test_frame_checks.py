@@ -156,6 +156,18 @@ def test_a_few_poses_of_a_tool_not_seen_are_no_other_mistake(slips, count, unit)
         assert "--robust" in said
 
 
+def test_a_third_of_wrong_poses_is_not_taken_for_lists_out_of_step():
+    """A shift by 20 rows made gross errors smaller, of images that still were 2 cm apart."""
+    protocol = jaxcal.Protocol(images=40, noise_mm=0.2)
+    images = jaxcal.simulate_recording(protocol, seed=2).calibration
+    poses = np.array(images.poses)
+    poses[-14:, :3, 3] /= 1000
+    pixels = np.asarray(images.measurements) / [0.2, 0.15] + [200, 0]
+    said = wrong_frames(Problem.from_arrays(poses, pixels, kind="pixel"))
+    assert said is not None
+    assert "do not fit together" in said
+
+
 def test_a_wrong_spacing_is_told_with_the_right_one(slips):
     right = slips.recorded(5, "px, known")
     said = wrong_frames(Problem.from_recording(replace(right, spacing=(0.14, 0.12)).images()))

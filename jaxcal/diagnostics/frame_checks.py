@@ -129,6 +129,7 @@ def wrong_frames(problem: Problem, estimate: tuple[str, ...] = ()) -> str | None
         return None
     before = fit.squares
     apart, extent = _typical_error(given, fit)
+    unfit = _is_overdetermined(count) and _is_unfit(apart, extent)
     corrected = [(words, replace(given, **changed), FACTOR) for words, changed in _mistakes(given)]
     best, told, least = before, None, FACTOR
     for words, data, factor in chain(corrected, _steps(images, farther=apart > UNFIT_MM / 2)):
@@ -136,11 +137,13 @@ def wrong_frames(problem: Problem, estimate: tuple[str, ...] = ()) -> str | None
         if other is None:
             continue
         squares = other.squares * count / other.reduced.images
-        if squares < best and _credible(other.scales, images, known):
+        if not (squares < best and _credible(other.scales, images, known)):
+            continue
+        # What leaves the images far apart corrects nothing: gross errors of some shrink as well.
+        if not _is_unfit(*_typical_error(data, other)):
             best, told, least = squares, words, factor
     if not _far_better(before, best, count, least):
         told = None
-    unfit = _is_overdetermined(count) and apart > max(UNFIT_MM, UNFIT * extent)
     # Where a few images spoil the fit to all, a wrong correction may seem to be right.
     if (told or unfit) and (few := _few_wrong(given, fit, best)):
         return few
@@ -305,6 +308,11 @@ def _typical_error(data: ImageData, fit: _Fit) -> tuple[float, float]:
     """Median error of the images under a fit, and the target's motion in them, mm."""
     errors, extent = _errors(data, fit)
     return float(np.median(errors)), extent
+
+
+def _is_unfit(apart: float, extent: float) -> bool:
+    """Whether images with these errors do not fit together (:func:`_typical_error`)."""
+    return apart > max(UNFIT_MM, UNFIT * extent)
 
 
 def _errors(data: ImageData, fit: _Fit) -> tuple[Float[np.ndarray, " n"], float]:
