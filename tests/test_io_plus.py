@@ -314,6 +314,35 @@ def test_what_plus_hears_of_the_image_while_it_runs_is_told(sent, inside, messag
     assert [message in note for note in notes] == ([True] if message else [])
 
 
+@pytest.mark.parametrize(
+    ("frames", "told"),
+    [
+        (
+            IMAGE,
+            [
+                "line 7: ImageUS to ProbeUS is kept, and Image to Probe added beside it",
+                "no tool is called Probe, there are 'ProbeUS', 'Reference'",
+            ],
+        ),
+        (("Image", "ProbeUS"), ["line 7: ImageUS to ProbeUS is kept, and Image to ProbeUS added"]),
+        (("ImageUS", "ProbeUS"), []),
+    ],
+)
+def test_other_names_of_image_and_probe_are_told(frames, told):
+    """PLUS would have gone on with the old transform, and no one would have noticed."""
+    stated = OTHER.replace("StylusTip", "ImageUS").replace('"Stylus"', '"ProbeUS"')
+    tools = [f"<DataSource Type='Tool' Id='{name}'/>" for name in ("probeUS", "Reference")]
+    old = re.sub(
+        rb"(<Device Id='V'[^/>]*)/>",
+        rb"\1><DataSources>" + "".join(tools).encode() + b"</DataSources></Device>",
+        configuration(stated),
+    )
+    assert b"probeUS" in old
+    _, notes = patched_configuration(old, frames, MATRIX)
+    assert len(notes) == len(told)
+    assert all(note.startswith(start) for note, start in zip(notes, told, strict=True))
+
+
 def test_paste_and_command():
     text = transform_element(IMAGE, MATRIX, error_mm=1.25, date=DATE)
     numbers = np.array(parse_xml(text.encode()).attributes["Matrix"].split(), float)

@@ -227,7 +227,9 @@ def patched_configuration(
     # The notes name lines of the new content, which is what their reader opens.
     root = parse_xml(new)
     others = [each for each in _transforms(root) if set(_frames(each)) != set(wanted)]
-    return new, _stale_scale(others, wanted, matrix) + _other_sources(root, others, wanted)
+    notes = _stale_scale(others, wanted, matrix) + _other_sources(root, others, wanted)
+    added = not _between(_transforms(parse_xml(content)), wanted)
+    return new, notes + (_other_names(root, others, wanted) if added else [])
 
 
 def _replaced(
@@ -381,6 +383,28 @@ def _other_sources(root: Element, others: list[Element], wanted: FramePair) -> l
         notes.append(
             f"line {element.line}: {source} to {target} is a second path from {source} as soon as "
             f"{when}: take it out then"
+        )
+    return notes
+
+
+def _other_names(root: Element, others: list[Element], wanted: FramePair) -> list[str]:
+    """Notes where image or probe seem to have other names than those of an added transform."""
+    notes, name = [], "(jaxcal export --image-frame, --probe-frame)"
+    for element in others:
+        source, target = _frames(element)
+        if source.startswith("Image") and source != wanted[0]:
+            notes.append(
+                f"line {element.line}: {source} to {target} is kept, and {' to '.join(wanted)} "
+                f"added beside it: if it should have been replaced, name these frames {name}"
+            )
+    sources = root.all("DataCollection/Device/DataSources/DataSource")
+    known = {frame for element in others for frame in _frames(element)}
+    tools = [each for each in sources if each.attributes.get("Type", "").lower() == "tool"]
+    sent = [capitalised(each.attributes.get("Id", "")) for each in tools]
+    if sent and wanted[1] not in (*sent, *known):
+        notes.append(
+            f"no tool is called {wanted[1]}, there are {', '.join(map(quoted, sent))}: name the "
+            f"one on the probe {name}"
         )
     return notes
 
