@@ -412,9 +412,15 @@ def test_images_counted_from_1_in_one_of_two_tables_are_told(tmp_path, of_poses,
 
 
 @pytest.mark.parametrize(
-    ("unit", "interval", "told"), [("", 20.0, 1), (" [ms]", 20.0, 0), ("", 0.02, 0)]
+    ("unit", "interval", "told"),
+    [
+        ("", 20.0, "are they in ms"),
+        ("", 0.02 / 86400, "are they in days"),
+        (" [ms]", 20.0, ""),
+        ("", 0.02, ""),
+    ],
 )
-def test_times_in_ms_in_both_of_two_tables_are_told(tmp_path, unit, interval, told):
+def test_times_that_are_hardly_in_s_in_both_of_two_tables_are_told(tmp_path, unit, interval, told):
     """A lag in s was a thousand times too short, and another lag was not noticed."""
     times = interval * np.arange(6)
     poses = [times, *np.column_stack(POSE_COLUMNS).T]
@@ -422,10 +428,23 @@ def test_times_in_ms_in_both_of_two_tables_are_told(tmp_path, unit, interval, to
     (tmp_path / "p.csv").write_text(_named([f"time{unit}", "u", "v"], [times, *PIXELS.T]))
     files = [tmp_path / "poses.csv", tmp_path / "p.csv"]
     notes = import_files(files).notes
-    asked = [note for note in notes if "are 20 s apart if times are in s" in note]
-    assert len(asked) == told
-    with pytest.raises(InputError, match="are they in ms" if told else "too few images"):
+    apart = f"are {interval:.3g} s apart if times are in s"
+    assert [told in note for note in notes if apart in note] == ([True] if told else [])
+    with pytest.raises(InputError, match=told or "too few images"):
         import_files(files, ImportOptions(lag_s="auto"))
+
+
+@pytest.mark.parametrize(("rate", "told"), [(1.0, False), (0.1, True)])
+def test_numbers_of_another_device_are_told_from_their_times(tmp_path, rate, told):
+    """Rows were matched by the frame numbers of a tracker and of a scanner, without a word."""
+    numbers = np.arange(6)
+    poses = [numbers, rate * numbers, *np.column_stack(POSE_COLUMNS).T]
+    (tmp_path / "poses.csv").write_text(_named(["frame", "time", *POSE_NAMES], poses))
+    # Another clock alone is no contradiction.
+    points = [numbers, 100 + numbers, *PIXELS.T]
+    (tmp_path / "p.csv").write_text(_named(["frame", "time", "u", "v"], points))
+    notes = import_files([tmp_path / "poses.csv", tmp_path / "p.csv"]).notes
+    assert ["do both count the same images" in note for note in notes] == [True] * told
 
 
 def test_a_table_with_both_is_no_one_of_two_tables(tmp_path):

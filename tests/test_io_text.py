@@ -366,6 +366,17 @@ def test_the_kind_of_a_file_is_told_from_its_first_line(tmp_path):
         read_pose_table(path)
 
 
+def test_points_between_thousands_are_not_read_as_decimal_signs(tmp_path):
+    """A German spreadsheet writes -1686 as -1.686, beside 107,5: it was read as -1.686."""
+    path = tmp_path / "table.csv"
+    path.write_text("u;v\n107,5;1.686\n")
+    with pytest.raises(FormatError, match=r"table\.csv:2: numbers have commas and points"):
+        read_pose_table(path)
+    for rows in ("107,5;686\n", "107.5;1.686\n"):
+        path.write_text("u;v\n" + rows)
+        assert len(read_pose_table(path)) == 1
+
+
 def test_controls_in_a_slip_are_escaped(tmp_path):
     lines = csv_lines()[0]
     path = tmp_path / "table.csv"

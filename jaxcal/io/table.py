@@ -67,6 +67,7 @@ class Table:
         """
         chosen = range(len(self.rows)) if rows is None else rows
         values = np.empty((len(chosen), len(columns)))
+        marks: set[str] = set()
         for place, row in enumerate(chosen):
             texts = [self.rows[row][column] for column in columns]
             found = parse_numbers(texts, decimal_comma=self.separator != ",")
@@ -76,6 +77,13 @@ class Table:
                 why = f"is {text}" if value is not None else f"is not a number: {quoted(text)}"
                 raise FormatError(f"{self.row(row)}: {self.column(column)} {why}")
             values[place] = found
+            if self.separator != ",":
+                marks.update(mark for mark in ",." if any(mark in text for text in texts))
+                if len(marks) > 1:
+                    raise FormatError(
+                        f"{self.row(row)}: numbers have commas and points in these columns: which "
+                        "is the decimal sign? Save them without marks between thousands"
+                    )
         return values
 
     def column(self, column: int) -> str:

@@ -19,12 +19,14 @@ from jaxcal.io.importing.poses_by_time import (
 )
 from jaxcal.io.sequence import TrackedSequence
 from jaxcal.io.text import PoseTable
-from jaxcal.runtime.array_types import Bool, Float
+from jaxcal.runtime.array_types import Bool, Float, Int
 from jaxcal.runtime.messages import counted
 
 _SLOW_S = 1.0
 """Poses at least so far apart make one ask for the unit of times: trackers are faster, and one of
 1 kHz has this interval if its ms are taken for s."""
+_FAST_S = 1e-4
+"""So do poses that are nearer to one another: days, as MATLAB counts, taken for s."""
 
 
 def one_of_two_tables(
@@ -84,12 +86,13 @@ def _poses_of(
         if named is not None and wanted is not None:
             places = _rows_by_image(poses, named)
             rows = np.array([places.get(image, -1) for image in _rows_by_image(points, wanted)])
-            lost = counted(int((rows < 0).sum()), "point")
-            said = [f"{lost} left out: {poses.name} has no pose of that image"]
-            if wanted is points.frame:
-                said[0] += _counted_otherwise(poses, points)
+            notes = _contradicting_times(poses, points, rows)
+            if lost := int((rows < 0).sum()):
+                left = f"{counted(lost, 'point')} left out: {poses.name} has no pose of that image"
+                of_frames = wanted is points.frame
+                notes.append(left + (_counted_otherwise(poses, points) if of_frames else ""))
             _refuse_lag(lag_s)
-            return poses.poses[rows], rows >= 0, None, said * bool((rows < 0).any())
+            return poses.poses[rows], rows >= 0, None, notes
     if poses.time is not None and points.time is not None:
         everywhere = np.ones(len(points), bool)
         images = TrackedSequence(
@@ -118,6 +121,28 @@ def _poses_of(
     )
 
 
+def _contradicting_times(
+    poses: PoseTable, points: PoseTable, rows: Int[np.ndarray, " n"]
+) -> list[str]:
+    """A note if what was matched by number or name was not taken at the same times.
+
+    Two clocks may be apart, but by the same time throughout. ``rows`` are the poses of the points,
+    -1 for none.
+    """
+    if poses.time is None or points.time is None or (rows >= 0).sum() < 2:
+        return []
+    asked = points.time[rows >= 0]
+    apart = asked - poses.time[rows[rows >= 0]]
+    apart = np.abs(apart - np.median(apart))
+    if np.median(apart) <= np.median(np.diff(np.sort(asked))):
+        return []
+    return [
+        f"times of {points.name} and of the poses that it names differ by up to {apart.max():.3g} "
+        "s more than usual: do both count the same images, and time in the same unit? (without a "
+        "column frame or file they are matched by time)"
+    ]
+
+
 def _counted_otherwise(poses: PoseTable, points: PoseTable) -> str:
     """A hint if one table seems to number the images from 0 and the other one from 1."""
     assert poses.frame is not None
@@ -133,13 +158,18 @@ def _counted_otherwise(poses: PoseTable, points: PoseTable) -> str:
 
 
 def _unit_in_doubt(poses: PoseTable, points: PoseTable, track: PoseTrack) -> list[str]:
-    """A note if times may be in ms in both tables, so that a lag, which is in s, is another one."""
-    if poses.time_stated or points.time_stated or track.interval_s < _SLOW_S:
+    """A note if times of both tables are hardly in s, so that a lag, which is, is another one."""
+    stated = poses.time_stated or points.time_stated
+    if stated or _FAST_S < track.interval_s < _SLOW_S:
         return []
+    advice = (
+        "are they in ms, us or ns? Name the columns time [ms], [us], [ns] or [s]"
+        if track.interval_s >= _SLOW_S
+        else "are they in days or hours? Give them in s"
+    )
     return [
         f"poses of {poses.name} are {track.interval_s:.3g} s apart if times are in s (no header "
-        "states their unit): are they in ms, us or ns? Name the columns time [ms], [us], [ns] or "
-        "[s]"
+        f"states their unit): {advice}"
     ]
 
 
