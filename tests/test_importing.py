@@ -963,6 +963,16 @@ def test_label_without_a_number(tmp_path, sequence):
         import_files([sequence, tmp_path / "p.fcsv"], ImportOptions(points="labels"))
 
 
+@pytest.mark.parametrize(("first", "told"), [(1, True), (0, False)])
+def test_labels_as_slicer_numbers_them_are_asked_about(tmp_path, sequence, first, told):
+    """F-1, F-2, ... count the points, unless somebody has renamed them."""
+    document = json.loads(markups("LPS", 1, [f"F-{first + k}" for k in range(6)]))
+    del document["markups"][0]["controlPoints"][5]
+    (tmp_path / "p.json").write_text(json.dumps(document))
+    notes = import_files([sequence, tmp_path / "p.json"], ImportOptions(points="labels")).notes
+    assert ["as Slicer numbers points by itself" in n for n in notes].count(True) == told
+
+
 def test_markups_are_ras(tmp_path):
     (tmp_path / "p.mrk.json").write_text(markups("LPS", 1, "012345"))
     found = read_markups(tmp_path / "p.mrk.json")

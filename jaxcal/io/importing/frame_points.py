@@ -62,6 +62,12 @@ def points_of_markups(
         rows = _rows_of_markups(markups.labels, sequence, assignment)
     unplaced = counted(markups.unplaced, "point", "was", "were")
     notes = [f"{name}: {unplaced} not placed"] if markups.unplaced else []
+    as_placed = assignment == "labels" and np.array_equal(rows, np.arange(1, len(rows) + 1))
+    if as_placed and sequence.numbers is None:
+        notes.append(
+            f"{name}: labels end in 1 to {len(rows)}, as Slicer numbers points by itself: were "
+            "they placed in these frames? (the first of a sequence is 0)"
+        )
     return FramePoints(_distinct(rows, sequence, name), pixels, "pixel", notes)
 
 
