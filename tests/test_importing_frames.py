@@ -743,6 +743,17 @@ def swept(t: np.ndarray) -> np.ndarray:
     return matrices_from_rotations(Rotation.from_rotvec(turns).as_matrix(), moved)
 
 
+@pytest.mark.parametrize(
+    ("after", "pace", "told"), [(0.0, 1.0, True), (0.3, 1.0, False), (0.0, 0.001, False)]
+)
+def test_stamps_of_whole_seconds_are_told_where_the_probe_moves(after, pace, told):
+    """As files' dates state them. A lag alone was named, which corrects only their mean."""
+    log, times = np.arange(0.01, 9.0, 0.02), after + np.arange(1.0, 8.0)
+    images = tracked(times, swept(times))
+    _, notes = with_poses_by_time(images, tracked(log, swept(pace * log)))
+    assert ["are whole seconds" in note for note in notes] == [False] + [True] * told
+
+
 @pytest.fixture
 def lagging(tmp_path):
     """Images that show where the probe was 80 ms before their stamps, and the tracker's log."""

@@ -32,6 +32,8 @@ tracking of less than this part of the images."""
 _SHARED = 0.2
 """Largest share of poses with the time stamp of another; stamps that are rounded to 1.25 intervals
 between poses give this share."""
+_FEWEST_ROUNDED = 5
+"""So many times that are all whole seconds are not so by chance."""
 _TOLD_MM = 0.5
 """Larger errors of interpolation are reported; a tracker's noise looks like smaller ones."""
 _LONGEST_GAP_OF_VELOCITY_S = 0.25
@@ -214,6 +216,7 @@ def with_poses_by_time(
             f"interpolated poses are wrong by about {cost:.1f} mm (RMS, from leaving poses out); "
             "record poses more often, or hold the probe still for each image"
         )
+    notes += _whole_seconds(images, track)
     if not between.all():
         notes.append(_without_pose(asked, between, track))
     return replace(
@@ -223,6 +226,24 @@ def with_poses_by_time(
         length_stated=tracking.length_stated,
         without_status=(),
     ), notes
+
+
+def _whole_seconds(images: TrackedSequence, track: PoseTrack) -> list[str]:
+    """A note if images of a moving probe are stamped with whole seconds, as files' dates are."""
+    if len(images) < _FEWEST_ROUNDED or (images.time % 1).any() or not (track.time % 1).any():
+        return []
+    velocity = track.velocities(images.time)
+    if velocity is None:
+        return []
+    # Of a time that was rounded by an equally probable part of a second.
+    error = np.sqrt(np.nanmean(np.sum(velocity[:, :3] ** 2, axis=1)) / 12)
+    if error <= _TOLD_MM:
+        return []
+    return [
+        f"times of {images.source} are whole seconds, and the probe moves: if they were rounded, "
+        f"poses are wrong by about {error:.1f} mm (RMS), which no lag corrects; record fractions "
+        "of a second, or hold the probe still for each image"
+    ]
 
 
 def better_lag(
@@ -240,13 +261,14 @@ def better_lag(
     if found is None or found.evidence <= LAG_EVIDENCE:
         return []
     told = lag_s + found.lag_s
-    sure, state = f" (SD {found.sd_s:.2g} s)", f"state it (--lag {told:.3f})"
+    sure = f" (SD {found.sd_s:.2g} s)"
+    advice = f"state it (--lag {told:.3f}), or hold the probe still for each image"
     if not np.isfinite(found.sd_s):
-        sure, state = ", where the search ends,", "do images and poses use the same clock?"
+        sure, advice = ", where the search ends,", "do images and poses use the same clock?"
     return [
         f"the points fit the poses better at a lag of {told:.3f} s{sure} than at {lag_s:g} s: the "
         f"target comes out within {found.misfit_mm:.2g} mm of one place (RMS), not "
-        f"{found.given_mm:.2g} mm; {state}, or hold the probe still for each image"
+        f"{found.given_mm:.2g} mm; {advice}"
     ]
 
 
