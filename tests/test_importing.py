@@ -1030,6 +1030,9 @@ def test_stylus_tip_as_target(tmp_path, capsys):
     assert "choose others; --to Stylus if its tip is the target)" in capsys.readouterr().out
     assert main(["import", *sources, "--from", "Needle"]) == 2
     assert "no transforms lead from 'Needle'" in capsys.readouterr().err
+    write_sequence(tmp_path / "s.igs.mha", {REFERENCE: POSES}, np.arange(6.0))
+    assert main(["import", *sources]) == 2
+    assert "(--from); there are 'Reference', 'Tracker'" in capsys.readouterr().err
 
 
 def test_sources_are_not_overwritten(tmp_path, sequence, capsys):

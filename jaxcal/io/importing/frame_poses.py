@@ -224,7 +224,7 @@ def _chosen_frames(sequence: TrackedSequence, options: ImportOptions) -> tuple[s
     if start is None:
         raise InputError(
             f"{sequence.source}: name the tracked frame on the probe or tool (--from); there are "
-            f"{', '.join(map(quoted, tools))}"
+            f"{', '.join(map(quoted, tools or names))}"
         )
     start = start if start in names else capitalised(start)
     if options.target is not None:
