@@ -447,6 +447,24 @@ def test_numbers_of_another_device_are_told_from_their_times(tmp_path, rate, tol
     assert ["do both count the same images" in note for note in notes] == [True] * told
 
 
+def test_rows_left_out_of_two_tables_in_order_shift_no_others(tmp_path):
+    """An invalid row in each of the two gave the rows between them the pose of another image."""
+    poses = np.column_stack(POSE_COLUMNS).astype(object)
+    poses[1], points = "", PIXELS.astype(object)
+    (tmp_path / "poses.csv").write_text(_named(POSE_NAMES, poses.T))
+    for gap, kept in ((4, [0, 2, 3, 5]), (None, [0, 2, 3, 4, 5])):
+        if gap is not None:
+            points[gap] = "nan"
+        (tmp_path / "p.csv").write_text(_named(["u", "v"], points.T))
+        files = [tmp_path / "poses.csv", tmp_path / "p.csv"]
+        imported = import_files(files, ImportOptions(skip_invalid=True))
+        images = imported.recording.calibration
+        np.testing.assert_allclose(images.poses, POSES[kept], atol=1e-12)
+        np.testing.assert_array_equal(images.measurements, PIXELS[kept])
+        assert imported.notes[-1].startswith("1 point left out: ")
+        points = PIXELS
+
+
 def test_a_table_with_both_is_no_one_of_two_tables(tmp_path):
     """It ended in an error of numpy."""
     poses = [np.arange(6), *np.column_stack(POSE_COLUMNS).T]

@@ -87,10 +87,10 @@ def _poses_of(
             places = _rows_by_image(poses, named)
             rows = np.array([places.get(image, -1) for image in _rows_by_image(points, wanted)])
             notes = _contradicting_times(poses, points, rows)
-            if lost := int((rows < 0).sum()):
-                left = f"{counted(lost, 'point')} left out: {poses.name} has no pose of that image"
-                of_frames = wanted is points.frame
-                notes.append(left + (_counted_otherwise(poses, points) if of_frames else ""))
+            left = _left_out(poses, rows)
+            if left and wanted is points.frame:
+                left[0] += _counted_otherwise(poses, points)
+            notes += left
             _refuse_lag(lag_s)
             return poses.poses[rows], rows >= 0, None, notes
     if poses.time is not None and points.time is not None:
@@ -113,7 +113,12 @@ def _poses_of(
         return found, valid, track.velocities(points.time - lag_s), said + notes + doubt
     _refuse_lag(lag_s)
     unnamed = points.file is None and points.frame is None and points.time is None
-    if unnamed and len(poses) == len(points):
+    if unnamed and len(poses) + len(poses.skipped) == len(points) + len(points.skipped):
+        # Rows that were left out of one table as invalid have partners in the other.
+        places = {row: place for place, row in enumerate(poses.rows)}
+        rows = np.array([places.get(row, -1) for row in points.rows])
+        return poses.poses[rows], rows >= 0, None, _left_out(poses, rows)
+    if unnamed and len(poses) == len(points) and not points.skipped:
         return poses.poses, np.ones(len(points), bool), None, []
     raise InputError(
         f"{points.name}: which pose of {poses.name} belongs to which point? Give both tables a "
@@ -121,13 +126,19 @@ def _poses_of(
     )
 
 
+def _left_out(poses: PoseTable, rows: Int[np.ndarray, " n"]) -> list[str]:
+    """A note if points have no pose; ``rows`` are the poses of the points, -1 for none."""
+    lost = int((rows < 0).sum())
+    left = f"{counted(lost, 'point')} left out: {poses.name} has no pose of that image"
+    return [left] if lost else []
+
+
 def _contradicting_times(
     poses: PoseTable, points: PoseTable, rows: Int[np.ndarray, " n"]
 ) -> list[str]:
     """A note if what was matched by number or name was not taken at the same times.
 
-    Two clocks may be apart, but by the same time throughout. ``rows`` are the poses of the points,
-    -1 for none.
+    Two clocks may be apart, but by the same time throughout. ``rows`` as of :func:`_left_out`.
     """
     if poses.time is None or points.time is None or (rows >= 0).sum() < 2:
         return []
