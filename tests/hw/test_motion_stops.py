@@ -281,18 +281,23 @@ def test_a_caller_that_was_suspended_while_it_connects_does_not_move(monkeypatch
 
 
 def test_a_stop_while_it_connects_is_heard():
-    """At once after the setup, so that both may be read together."""
+    """At once after the setup, so that both may be read together; no program is sent any more."""
     with EmulatedRobot(version=CB_SERIES) as robot, ThreadPoolExecutor(1) as pool:
         motion = confirmed(robot)
         with closing(motion):
             started = pool.submit(motion.start)
             until(lambda: motion._process)
             motion.stop("the operator")
-            started.result()
+            with pytest.raises(StoppedError, match="the operator"):
+                started.result()
             assert motion._process.wait(timeout=5.0) == 1
             with pytest.raises(RefusedError, match="the operator"):
                 motion.check()
-        assert sent(robot, 3) == []
+        state = robot.state()
+        assert not state["loading"]
+        assert not state["running"]
+        # Of the last program that ended.
+        assert state["reason"] == ""
 
 
 def test_a_danger_told_after_a_hesitation_ends_motion():

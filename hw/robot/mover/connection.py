@@ -52,7 +52,7 @@ class Connection:
 
         Raises:
             DeviceError: the robot is another, cannot take a program now, or does not answer.
-            Ended: a connection was lost.
+            Ended: a connection was lost, a stop is latched, or the caller has left.
         """
         setup, inputs, controller = self._setup, self._inputs, self._controller
         check_plan(setup.plan)
@@ -130,7 +130,12 @@ class Connection:
         raise LostError("the controller sends no fresh poses, or runs no program", device="robot")
 
     def _check_state(self, remote: bool | None) -> None:
-        """Whether the robot can take a program now: ours would end whatever runs, unasked."""
+        """Whether the robot can take a program now: ours would end whatever runs, unasked.
+
+        Raises:
+            RefusedError: it cannot.
+            Ended: a stop is latched, or the caller has left: no program is needed any more.
+        """
         self._wait_for_packet()
         packet = self._inputs.packet
         problem = LOCAL if remote is False else ""
@@ -143,6 +148,11 @@ class Connection:
             self._inputs.read(self._clock.wall(0.01))
         if problem:
             raise refused(problem)
+        stop = self._inputs.latch.stop
+        if stop is not None:
+            raise Ended(stop.error)
+        if self._inputs.left:
+            raise Ended(refused("motion was closed"))
 
     def _watch_control(self) -> None:
         """In a thread of its own: no packet tells whether the robot is in remote control."""

@@ -100,6 +100,11 @@ class Inputs:
         self._reader, self._lag = reader, lag
 
     @property
+    def left(self) -> bool:
+        """Whether the caller is gone or going."""
+        return self._caller.left
+
+    @property
     def connected(self) -> bool:
         """Whether a packet has come."""
         return self._packet is not None
