@@ -138,7 +138,8 @@ class ActiveEcho:
         try:
             self._greet()
         except BaseException:
-            self.close()
+            # It was only asked to be silent.
+            self._release()
             raise
 
     def _greet(self) -> None:
@@ -297,13 +298,22 @@ class ActiveEcho:
             )
 
     def close(self) -> None:
-        """Silence the device if it still listens, and close the port; safe to repeat."""
-        if self._stopping:
-            return
+        """Silence the device if it still listens, and close the port; safe to repeat.
+
+        It is waited for until it says that it is silent: what was written but not read yet may be
+        lost when a connection over a network is closed.
+        """
+        try:
+            if not self._stopping and self._failure is None:
+                with contextlib.suppress(DeviceError):
+                    self.inject(False)
+                    self.stream(False)
+        finally:
+            self._release()
+
+    def _release(self) -> None:
+        """End the reader and close the port."""
         self._stopping = True
-        if self._failure is None:
-            with contextlib.suppress(LostError, StaleError):
-                self._transport.write(encode_line("PATT:STAT OFF") + encode_line("STRM OFF"))
         self._reader.join()
         self._transport.close()
 

@@ -79,8 +79,11 @@ def test_commands(emulator: AuspisEmulator) -> None:
         device.inject(False)
         assert not emulator.injection.on
         device.inject(True)
-    # Closing leaves the element silent.
-    until(lambda: not emulator.injection.on)
+        device.stream(True)
+        frames_of(device, 1)
+    # Closing waits until the element is silent.
+    assert not emulator.injection.on
+    assert not emulator._streaming
 
 
 def test_frames_are_what_the_element_heard(emulator: AuspisEmulator) -> None:
