@@ -43,6 +43,9 @@ _HOUSING_MM = (25.0, 60.0)
 _LONGEST_OFFSET_M = 1.0
 _LONGEST_SETTLE_S = 30.0
 """Given in ms, the robot would rest for minutes at every pose."""
+_LEAST_POSES_HZ = 20.0
+"""Until the next pose comes the newest one may be two periods old, with the bound of its latency:
+at fewer a second each would become older than 0.1 s, and the robot would stop."""
 _MOST_POSES_HZ = 1000.0
 """Twice as many as a controller sends."""
 _TIP_TOLERANCE_MM = 0.1
@@ -319,9 +322,12 @@ def _robot(table: dict[str, Any]) -> dict[str, Any]:
     """What a setup takes of the robot's table, by the names that it has there."""
     check_host(table["host"], "[robot] host")
     robot = {{"host": "robot_host"}.get(key, key): value for key, value in table.items()}
-    for key, most in {"settle_s": _LONGEST_SETTLE_S, "frequency_hz": _MOST_POSES_HZ}.items():
-        if key in robot and not 0 < robot[key] <= most:
-            raise InputError(f"[robot] {key} must be positive and at most {most:g}")
+    if not 0 < robot.get("settle_s", Setup.settle_s) <= _LONGEST_SETTLE_S:
+        raise InputError(f"[robot] settle_s must be positive and at most {_LONGEST_SETTLE_S:g}")
+    if not _LEAST_POSES_HZ <= robot.get("frequency_hz", _MOST_POSES_HZ) <= _MOST_POSES_HZ:
+        raise InputError(
+            f"[robot] frequency_hz must be {_LEAST_POSES_HZ:g} to {_MOST_POSES_HZ:g} poses a second"
+        )
     if "tcp_offset" in robot:
         offset = _numbers("tcp_offset", robot["tcp_offset"], (6,), "robot")
         if np.linalg.norm(offset[:3]) > _LONGEST_OFFSET_M:

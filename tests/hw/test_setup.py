@@ -84,6 +84,8 @@ def test_a_description_is_read(tmp_path):
         ("settle_s = 1", "settle_s = -1", "positive"),
         ("settle_s = 1", "settle_s = 300", r"\[robot\] settle_s must be positive and at most 30"),
         ("settle_s = 1", "settle = 1", "has no 'settle'"),
+        ("settle_s = 1", "frequency_hz = 1e-30", r"\[robot\] frequency_hz must be 20 to 1000"),
+        ("settle_s = 1", "frequency_hz = 1e30", r"\[robot\] frequency_hz must be 20 to 1000"),
         ("elements = 64", "elements = 64.5", "whole number"),
         ("elements = 64", "elements = 1", "elements"),
         ("point_mm = [350, -250, 80]", "point_mm = [350, nan, 80]", "point_mm must be 3 numbers"),
