@@ -9,7 +9,6 @@ import numpy as np
 
 from hw.acquisition.request import AcquisitionRequest, planned
 from hw.planning.poses import preview
-from hw.recording.file import check_new
 from hw.robot.limits import Limits
 from hw.robot.motion_plan import MotionPlan, plan_lines
 from hw.robot.path_checks import check_plan
@@ -24,12 +23,10 @@ def dry_run(
 
     Raises:
         InputError: a plan that cannot be made.
-        OutputError: a recording that cannot be made.
         RefusedError: a plan that the limits do not allow; it names the first pose or way.
     """
     if request is None:
         raise InputError("--resume needs --move: a dry run has nothing to resume")
-    check_new(path)
     plan = planned(setup, request)
     motion = MotionPlan(plan.poses, _dry_limits(setup), setup.tcp_offset or (0.0,) * 6, "dry run")
     course = check_plan(motion)

@@ -41,6 +41,8 @@ bench_seed_option = click.option(
 def recording_path(recording: str | None, default: str, resume: bool) -> str:
     """The file of a run: named after the time by default; a new one is named as recordings are.
 
+    A file that cannot be made is refused here, before anything that takes time.
+
     Args:
         recording: as the person named it; with ``resume`` not None.
         default: how a name begins that nobody gave.
@@ -48,11 +50,16 @@ def recording_path(recording: str | None, default: str, resume: bool) -> str:
 
     Raises:
         InputError: a name that hides from other programs, and from people, what is in the file.
+        OutputError: a new one is there already, or its folder is missing.
     """
     if recording is None:
-        return f"{default}-{datetime.now():%Y%m%d-%H%M%S}.h5"
-    if not resume and not recording.lower().endswith(RECORDING):
+        recording = f"{default}-{datetime.now():%Y%m%d-%H%M%S}.h5"
+    elif not resume and not recording.lower().endswith(RECORDING):
         raise InputError(f"{recording}: a recording is named {' or '.join(RECORDING)}")
+    if not resume:
+        from hw.recording.file import check_new
+
+        check_new(recording)
     return recording
 
 

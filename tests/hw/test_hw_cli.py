@@ -91,8 +91,10 @@ def test_a_dry_run_shows_the_plan_and_makes_nothing(tmp_path, monkeypatch, capsy
     path.write_text(good)
     (tmp_path / "old.h5").touch()
     for name, said in (("old.h5", "exists already"), ("no/out.h5", "there is no folder")):
-        assert main([arguments[0], name, *arguments[2:]]) != 0
-        assert said in capsys.readouterr().err
+        for command in (arguments, ["acquire", "out.h5", "--bench"], ["free-hand", "a", "out.h5"]):
+            assert main([name if given == "out.h5" else given for given in command]) == 2
+            # Before a bench is started, anything is connected or compiled.
+            assert capsys.readouterr().err.startswith(f"jaxcal-hw: error: {name}: {said}")
     armed = good.replace("settle_s = 1", 'model = "ur5"\ntcp_offset = [0, 0, 0.12, 0, 0, 0]')
     path.write_text(armed)
     assert main(arguments) == 0
