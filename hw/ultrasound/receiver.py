@@ -21,7 +21,7 @@ from hw.runtime.interrupts import lock_and_condition
 from hw.ultrasound.framing import MessageDecoder
 from jaxcal.data.poses import ROTATION_TOLERANCE, nearest_rotations
 from jaxcal.io.given_files import one_line
-from jaxcal.io.message_content import Picture, Pixels, StatusMessage, Tracked, TrackedFrame
+from jaxcal.io.message_content import ImageArray, Picture, StatusMessage, Tracked, TrackedFrame
 from jaxcal.io.openigtlink import PORT, RF_DEVICE, Message
 from jaxcal.runtime.array_types import Float
 
@@ -51,7 +51,7 @@ class Image:
     t_host: float
     t_device: float
     frame_id: int
-    array: Pixels
+    array: ImageArray
     spacing_mm: tuple[float, float]
     device: str
     late_s: float = 0.0

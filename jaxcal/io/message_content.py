@@ -13,7 +13,7 @@ class ContentError(ValueError):
     """A body whose CRC is right and whose content cannot be used; says why."""
 
 
-Pixels = UInt8[np.ndarray, "height width"] | Int16[np.ndarray, "height width"]
+ImageArray = UInt8[np.ndarray, "height width"] | Int16[np.ndarray, "height width"]
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Picture:
         spacing_mm: [lateral, axial] mm per pixel.
     """
 
-    array: Pixels
+    array: ImageArray
     spacing_mm: tuple[float, float]
 
 
