@@ -10,7 +10,6 @@ import struct
 import subprocess
 import sys
 import tempfile
-import warnings
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -87,8 +86,7 @@ import jax.numpy as jnp
 import jaxtyping
 import numpy as np
 import pytest
-from _pytest.runner import runtestprotocol
-from held_up import HeldUp
+from held_up import pytest_runtest_protocol, pytest_terminal_summary  # noqa: F401
 from scipy.spatial.transform import Rotation
 
 import jaxcal
@@ -135,7 +133,6 @@ pytest_runtestloop.__code__ = pytest_runtestloop.__code__.replace(co_stacksize=2
 pytest_runtestloop = pytest.hookimpl(tryfirst=True)(pytest_runtestloop)
 
 REAL_DATA = Path(__file__).parents[2] / "shared" / "data"
-HARDWARE = Path(__file__).parent / "hw"
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -277,63 +274,6 @@ LONGEST = (
     "test_files",
 )
 """Modules that take longest, which start first: no worker is left alone with one at the end."""
-
-
-ATTEMPTS = 10
-"""Most runs of a test against emulators that was held up."""
-
-EXCUSED_S, EXCUSED_REAL_TIME_S = 0.1, 0.015
-"""Delays of this process that excuse a failed test of ``tests/hw``, and a ``real_time`` one."""
-
-RUN_AGAIN = "run again"
-
-
-def _excused_s(item: pytest.Item) -> float | None:
-    if item.get_closest_marker("real_time") is not None:
-        return EXCUSED_REAL_TIME_S
-    return EXCUSED_S if HARDWARE in item.path.parents else None
-
-
-@pytest.hookimpl(tryfirst=True)
-def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool | None:
-    """Run a test against emulators again if it failed while the machine held this process up.
-
-    Such a failure says nothing about deadlines of a tenth of a second. On a machine that holds
-    nothing up the first failure counts. The summary names the tests that were run again.
-    """
-    excused_s = _excused_s(item)
-    if excused_s is None:
-        return None
-    item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
-    for attempt in range(ATTEMPTS):
-        with HeldUp() as held_up:
-            reports = runtestprotocol(item, log=False, nextitem=nextitem)
-        failed = any(report.failed for report in reports)
-        if not failed or held_up.longest_s < excused_s:
-            break
-        item.user_properties = [(RUN_AGAIN, attempt + 1)]
-        # What the failed run left open is not the next one's fault.
-        for name in ("last_type", "last_value", "last_traceback", "last_exc"):
-            vars(sys).pop(name, None)
-        with warnings.catch_warnings(action="ignore"):
-            gc.collect()
-    for report in reports:
-        item.ihook.pytest_runtest_logreport(report=report)
-    item.ihook.pytest_runtest_logfinish(nodeid=item.nodeid, location=item.location)
-    return True
-
-
-def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """The tests that were run again: one that is named on a quiet machine may have a fault."""
-    again = {
-        report.nodeid: dict(report.user_properties)[RUN_AGAIN]
-        for report in terminalreporter.stats.get("passed", [])
-        if RUN_AGAIN in dict(report.user_properties)
-    }
-    if again:
-        terminalreporter.section("run again, since the machine held them up")
-        for name, times in again.items():
-            terminalreporter.line(f"{name} ({times} times)" if times > 1 else name)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
