@@ -150,15 +150,16 @@ class Motion:
                 raise refused(
                     "this confirmation was used for an earlier connection; confirm the plan again"
                 )
-        if self._stop is not None:
-            self._ended = self._stop
-            raise refused(f"motion was stopped ({self._stop.args[0]})")
         setup = Setup(
             self.host, self.plan, given, self.clock, self.dry_run, self._caller_s
         ).message()
         try:
             with self._sending:
-                # The setup must come first: a stop that is asked for now waits until it is sent.
+                # Here, since a stop that came before had nobody to be sent to. The setup must come
+                # first: a stop that is asked for now waits until it is sent.
+                if self._stop is not None:
+                    self._ended = self._stop
+                    raise refused(f"motion was stopped ({self._stop.args[0]})")
                 self._process = spawn("hw.robot.mover", stdin=True)
                 # A long setup fills the pipe: if the process does not read it, the write would
                 # wait without end. Before it has read all of it, it has not connected.

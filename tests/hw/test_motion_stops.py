@@ -37,6 +37,7 @@ from waiting import until
 from hw.robot.identity import read_identity
 from hw.robot.motion import Motion
 from hw.robot.motion_plan import MotionPlan
+from hw.robot.mover.messages import Setup
 from hw.runtime.errors import LostError, RefusedError, StaleError, StoppedError
 from hw.runtime.interrupts import as_interrupts
 from jaxcal.runtime.isolated import import_path
@@ -233,6 +234,20 @@ def test_a_stop_before_the_start_or_at_rest_is_kept():
             with pytest.raises(RefusedError, match=r"the operator pressed stop.*confirm the plan"):
                 motion.move_to(HOME)
         assert sent(robot, 3) == []
+
+
+def test_a_stop_right_before_the_process_is_started_is_kept(monkeypatch):
+    """There was nobody to tell of it yet, and the process that was started next connected."""
+    motion = Motion("127.0.0.2", PLAN, None)
+
+    def message(setup: Setup) -> dict:
+        motion.stop("not today")
+        return {}
+
+    monkeypatch.setattr(Setup, "message", message)
+    with pytest.raises(RefusedError, match=r"was stopped \(not today\)"):
+        motion.start()
+    assert motion._process is None
 
 
 @pytest.mark.parametrize("moving_when", ["at rest", "in motion"])
