@@ -150,7 +150,7 @@ def acquire(
     phantom, operator = request.phantom, request.operator
     controller = controller or request.controller
     path = recording_path(recording, "acquisition", resume)
-    _check_installed(phantom, bench, move)
+    _check_installed(bench, move)
 
     prepare_jax()
     with ExitStack() as stack:
@@ -199,13 +199,13 @@ def _recorded(recording: str, bench: bool) -> AcquisitionRequest:
     return recorded
 
 
-def _check_installed(phantom: str, bench: bool, move: bool) -> None:
+def _check_installed(bench: bool, move: bool) -> None:
     """Refuse to begin without the drivers: before a file is made, and before anybody confirms."""
     from hw.runtime.extras import missing
 
-    needed: dict[str, Extra] = {"rtde_control": "robot"} if bench or move else {}
-    if bench and phantom == PHANTOMS[0]:
-        needed |= {"cobs": "serial", "serial": "serial"}
+    if not (bench or move):
+        return
+    needed: dict[str, Extra] = {"rtde_control": "robot", "cobs": "serial", "serial": "serial"}
     for module, extra in needed.items():
         if (cure := missing(module, extra=extra)) is not None:
             raise InputError(cure)

@@ -9,7 +9,9 @@ import re
 import signal
 import subprocess
 import sys
+from importlib.machinery import ModuleSpec
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -179,16 +181,19 @@ def test_a_bench_serves_until_ctrl_c_whatever_its_standard_input_is(given):
     assert (process.returncode, complaints) == (0, "")
 
 
-def test_without_ur_rtde_no_file_is_made_and_nobody_is_asked(tmp_path):
-    code = (
-        "import sys; sys.modules['rtde_control'] = None; from hw.cli.main import main; "
-        "sys.exit(main(['acquire', 'rec.h5', '--bench']))"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path
-    )
-    assert done.returncode == 2
-    assert done.stderr.count("rtde_control is not installed") == 1
+@pytest.mark.parametrize("driver", ["rtde_control", "serial"])
+@pytest.mark.parametrize("where", ["--bench --phantom cross-wire", "--setup x.toml --move"])
+def test_without_a_driver_no_file_is_made_and_nobody_is_asked(
+    tmp_path, monkeypatch, capsys, driver, where
+):
+    monkeypatch.chdir(tmp_path)
+    for module in ("rtde_control", "cobs", "serial"):
+        there = None if module == driver else ModuleType(module)
+        if there is not None:
+            there.__spec__ = ModuleSpec(module, None)
+        monkeypatch.setitem(sys.modules, module, there)
+    assert main(["acquire", "rec.h5", *where.split()]) == 2
+    assert capsys.readouterr().err.startswith(f"jaxcal-hw: error: {driver} is not installed: ")
     assert list(tmp_path.iterdir()) == []
 
 
