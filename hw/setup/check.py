@@ -143,6 +143,9 @@ def _come(read: Callable[[float], _Item], clock: Clock, seconds: float) -> list[
     """What a stream sends while it is watched for some bench seconds, or until it is lost.
 
     A process that is suspended or held up does not watch: what came meanwhile is still unread.
+
+    Raises:
+        DeviceError: it was lost before anything came.
     """
     items: list[_Item] = []
     waiting = Waiting(clock)
@@ -152,5 +155,7 @@ def _come(read: Callable[[float], _Item], clock: Clock, seconds: float) -> list[
         except StaleError:
             continue
         except DeviceError:
-            break
+            if items:
+                break
+            raise
     return items

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import re
 import shlex
+import socket
 import tomllib
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +16,8 @@ import jaxcal
 from hw.acquisition.job import Job, resume_command
 from hw.acquisition.request import AcquisitionRequest
 from hw.cli.main import main
+from hw.runtime.errors import LostError
+from hw.setup.check import _ultrasound as look_at_ultrasound
 from hw.setup.description import _TABLES, load_setup
 
 GOOD = """
@@ -162,3 +166,13 @@ def test_the_example_is_a_setup(tmp_path, capsys):
     assert "exists; name another file" in capsys.readouterr().err
     assert main(["setup"]) == 0
     assert capsys.readouterr().out == path.read_text()
+
+
+def test_a_server_that_hangs_up_is_not_taken_for_a_frozen_machine(tmp_path):
+    path = tmp_path / "bench.toml"
+    path.write_text(GOOD)
+    with socket.create_server(("127.0.0.1", 0)) as server, ThreadPoolExecutor(1) as pool:
+        pool.submit(lambda: server.accept()[0].close())
+        setup = replace(load_setup(path), ultrasound=server.getsockname())
+        with pytest.raises(LostError, match="has closed the connection"):
+            look_at_ultrasound(setup, 0.5)
