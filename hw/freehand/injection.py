@@ -42,7 +42,7 @@ from hw.recording.resuming import (
     described_electronics,
 )
 from hw.recording.session import DELAY_S, SilenceLimits, median_times
-from hw.runtime.errors import DeviceError, StaleError
+from hw.runtime.errors import StaleError
 from hw.runtime.rigid import mean_pose, turn_deg
 from hw.setup.description import HandHeldSetup
 from hw.ultrasound.receiver import UltrasoundStream
@@ -127,7 +127,6 @@ def acquire_by_injection(
         posed = PosedImages(stream, asked.source, asked.target_frame, asked.lag_s)
         person.say(f"images of {posed.device!r}; poses from {posed.pair[0]} to {posed.pair[1]}")
         echo = stack.enter_context(ActiveEcho(setup.active_echo_url, lines=probe.elements))
-        stack.callback(_switch_off, echo)
         echo.set_threshold(setup.search.low_threshold)
         echo.stream(True)
         unit = described_electronics(echo)
@@ -156,12 +155,6 @@ def _recorder(
         settings=json.dumps({_KIND: known}),
     )
     return Recorder(path, header)
-
-
-def _switch_off(echo: ActiveEcho) -> None:
-    """Switch injection off, whatever happened before."""
-    with contextlib.suppress(DeviceError):
-        echo.inject(False)
 
 
 @dataclass
