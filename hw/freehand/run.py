@@ -17,6 +17,7 @@ from hw.recording.file import RecordingWriter
 from hw.recording.recorder import Recorder, no_digest
 from hw.runtime.clock import REAL
 from hw.runtime.errors import DeviceError
+from hw.runtime.hosts import address
 from jaxcal import CalibrationError, InputError
 from jaxcal.data.recording import MINIMUM_IMAGES, MetresError, check_pose_units
 from jaxcal.io.hdf5 import IMAGES
@@ -102,7 +103,7 @@ class Run(ABC):
         except (DeviceError, CalibrationError) as error:
             reason, interrupted = str(error), False
         asked, path = self.asked, self.recorder.kept
-        server = f"{asked.host}:{asked.port}"
+        server = address(asked.host, asked.port)
         again = command_line(["jaxcal-hw", "free-hand", server, path, *self.options, "--resume"])
         state = f"{reason}; {len(self.kept)} of {asked.images} images are in {path}"
         raise FreeHandStopped(f"{state}; go on with: {again}", interrupted=interrupted)

@@ -6,6 +6,11 @@ from jaxcal import InputError
 from jaxcal.runtime.messages import quoted
 
 
+def address(host: str, port: int) -> str:
+    """``host:port`` as the command line takes it: IPv6 in brackets, ``[::1]:18944``."""
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+
 def check_host(host: str, what: str = "host") -> None:
     """Refuse text that cannot be the name or address of a computer, before anything connects.
 

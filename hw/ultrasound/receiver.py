@@ -17,6 +17,7 @@ import numpy as np
 
 from hw.runtime.clock import REAL, Clock, Lag
 from hw.runtime.errors import Device, DeviceError, LostError, StaleError
+from hw.runtime.hosts import address
 from hw.runtime.interrupts import lock_and_condition
 from hw.ultrasound.framing import MessageDecoder
 from jaxcal.data.poses import ROTATION_TOLERANCE, nearest_rotations
@@ -157,7 +158,7 @@ class UltrasoundStream:
     @property
     def address(self) -> str:
         """``host:port``."""
-        return f"{self.host}:{self.port}"
+        return address(self.host, self.port)
 
     def start(self) -> UltrasoundStream:
         """Connect and begin to receive.

@@ -20,6 +20,7 @@ from hw.bench.ultrasound import ImageServer
 from hw.runtime.clock import Clock
 from hw.runtime.errors import DeviceError, LostError, StaleError
 from hw.ultrasound import Image, UltrasoundStream
+from jaxcal.cli.common import Server
 from jaxcal.io.message_content import Picture
 from jaxcal.io.openigtlink import HEADER_SIZE, Message, encode
 
@@ -366,3 +367,10 @@ def test_nothing_is_lost_at_thirty_frames_a_second(seconds: float) -> None:
     assert np.diff(frames).tolist() == [1] * (len(frames) - 1)
     assert seen.lost == seen.dropped == seen.crc_errors == server.refused == 0
     assert heard.lost == heard.dropped == heard.crc_errors == emulator.refused == 0
+
+
+@pytest.mark.parametrize("host", ["::1", "127.0.0.1", "plus"])
+def test_the_command_line_takes_an_address_as_it_is_told(host):
+    """As where a run ended, with the command that goes on."""
+    told = UltrasoundStream(host, 80).address
+    assert Server().convert(told, None, None) == (host, 80)
