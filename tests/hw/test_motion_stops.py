@@ -285,14 +285,16 @@ def test_a_process_that_was_suspended_at_rest_is_named(monkeypatch):
 def test_a_caller_that_was_suspended_while_it_connects_does_not_move(monkeypatch):
     monkeypatch.setattr("hw.robot.motion._SUSPENDED_WALL_S", 0.2)
     script = f"sleep 0.2; kill -STOP {os.getpid()}; sleep 1; kill -CONT {os.getpid()}"
-    with (
-        EmulatedRobot() as robot,
-        subprocess.Popen(["sh", "-c", script]),
-        moving(robot) as motion,
-        pytest.raises(RefusedError, match="moves the robot, was suspended for"),
-    ):
-        motion.move_to(PLAN.targets[2])
-    assert motion.ended
+    with EmulatedRobot() as robot:
+        motion = confirmed(robot)
+        with (
+            subprocess.Popen(["sh", "-c", script]),
+            pytest.raises((RefusedError, StoppedError), match="moves the robot, was suspended for"),
+            motion,
+        ):
+            motion.move_to(PLAN.targets[2])
+        assert motion.ended
+        assert sent(robot, 3) == []
 
 
 def test_a_stop_while_it_connects_is_heard():
