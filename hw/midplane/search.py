@@ -42,17 +42,9 @@ _MOST = {
     "factor": 10.0,
 }
 """Of the others."""
-_POSITIVE = (
-    "coarse_mm",
-    "fine_mm",
-    "finest_mm",
-    "frames",
-    "epsilon_mm",
-    "top_fraction",
-    "most_moves",
-    "full_scale",
-    "factor",
-)
+_LEAST = dict.fromkeys(("coarse_mm", "fine_mm", "finest_mm", "epsilon_mm"), 0.01)
+"""Of the steps: no robot makes shorter ones, and a raster of 1e-12 mm is more than any memory."""
+_POSITIVE = ("frames", "top_fraction", "most_moves", "full_scale", "factor")
 
 OnStop = Callable[[float, float, int], None]
 """Told of a stop: offset (mm), amplitude (counts), threshold."""
@@ -173,9 +165,9 @@ class Settings:
     def __post_init__(self) -> None:
         for name in self.__dataclass_fields__:
             value, most = getattr(self, name), _MOST.get(name, _LONGEST_MM)
-            positive = name in _POSITIVE
-            if not ((value > 0 if positive else value >= 0) and value <= most):
-                bounds = f"above 0 and at most {most:g}" if positive else f"0 to {most:g}"
+            least, positive = _LEAST.get(name, 0.0), name in _POSITIVE
+            if not (least <= value <= most and (value > 0 or not positive)):
+                bounds = f"above 0 and at most {most:g}" if positive else f"{least:g} to {most:g}"
                 raise InputError(f"{name} must be {bounds}, not {value}")
 
     def bracket(self, centre_mm: float, half_mm: float, sd_mm: float) -> Bracket:

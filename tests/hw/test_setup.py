@@ -119,7 +119,9 @@ def test_a_description_is_read(tmp_path):
         ("[search]", "[search]\nreach_mm = 30", r"\[search\] reach_mm is 30, but .* only 25"),
         ("search_mm = 25", "search_mm = 25\nhull_mm = []", r"\[limits\] hull_mm must have corners"),
         ("search_mm = 25", "", r"\[limits\] search_mm of 0 leaves no room for the search"),
-        ("fine_mm = 0.2", "fine_mm = -0.2", r"\[search\] fine_mm must be above 0 and at most 50"),
+        ("fine_mm = 0.2", "fine_mm = -0.2", r"\[search\] fine_mm must be 0.01 to 50"),
+        ("fine_mm = 0.2", "coarse_mm = 1e-12", r"\[search\] coarse_mm must be 0.01 to 50"),
+        ("fine_mm = 0.2", "top_fraction = 0", r"\[search\] top_fraction must be above 0 and"),
         (
             "frames = 5",
             f"frames = 1{'0' * 90}",
