@@ -58,8 +58,9 @@ def apply(
     calibration (with estimated pixel sizes) and of --pixel-sd, but not those of the pose. Those of
     the calibration are what its covariance says, times the factor for few images that the TRE of
     its report has, too (variance_factor). If its verdict expects larger errors still, that factor
-    is printed on standard error. Points and SDs are rounded to 1e-6 mm. Masked images of a recording are left out; a last column, image,
-    has the numbers of the others. With --skip-invalid a last column, line, says which row is which.
+    is printed on standard error. Points and SDs are rounded to 1e-6 mm. Masked images of a
+    recording are left out; a last column, image, has the numbers of the others. With --skip-invalid
+    a last column, line, says which row is which.
     """
     import numpy as np
 
