@@ -156,6 +156,17 @@ def test_a_few_poses_of_a_tool_not_seen_are_no_other_mistake(slips, count, unit)
         assert "--robust" in said
 
 
+def test_a_few_mirrored_images_are_asked_about():
+    """The left of the image was exchanged with its right in part of the recording."""
+    protocol = jaxcal.Protocol(images=40, noise_mm=0.2)
+    images = jaxcal.simulate_recording(protocol, seed=2).calibration
+    points = np.array(images.measurements)
+    points[-13:, 0] *= -1
+    said = wrong_frames(Problem.from_arrays(images.poses, points))
+    assert said is not None
+    assert "or mirrored images?" in said
+
+
 def test_a_third_of_wrong_poses_is_not_taken_for_lists_out_of_step():
     """A shift by 20 rows made gross errors smaller, of images that still were 2 cm apart."""
     protocol = jaxcal.Protocol(images=40, noise_mm=0.2)

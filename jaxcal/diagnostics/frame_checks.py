@@ -197,8 +197,8 @@ def _few_wrong(data: ImageData, fit: _Fit, best: float) -> str | None:
         return None
     return (
         f"{wrong} of {count} images that were compared {'do' if wrong > 1 else 'does'} not fit the "
-        f"others, which fit each other (typical error {_mm(rest)}): a tool that was not seen, or "
-        "another target? A robust solve (--robust) leaves such images out"
+        f"others, which fit each other (typical error {_mm(rest)}): a tool that was not seen, "
+        "another target, or mirrored images? A robust solve (--robust) leaves such images out"
     )
 
 
