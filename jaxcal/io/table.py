@@ -78,7 +78,7 @@ class Table:
                 raise FormatError(f"{self.row(row)}: {self.column(column)} {why}")
             values[place] = found
             if self.separator != ",":
-                marks.update(mark for mark in ",." if any(mark in text for text in texts))
+                marks.update(set("".join(texts)) & {",", "."})
                 if len(marks) > 1:
                     raise FormatError(
                         f"{self.row(row)}: numbers have commas and points in these columns: which "
