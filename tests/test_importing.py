@@ -104,6 +104,12 @@ def test_times_of_every_kind(tmp_path):
         np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
+@pytest.mark.parametrize("letter", ["u", "\u00b5", "\u03bc"])
+def test_microseconds_as_they_are_written(letter):
+    """Of the two letters that look alike, the Greek one was refused."""
+    assert columns_of_header([f"time [{letter}s]", "u", "v"], None).time_s == 1e-6
+
+
 def test_quaternion_order_is_asked_for(tmp_path):
     numbered = table([*NAMES[:5], "q1", "q2", "q3", "q4"], COLUMNS)
     bare = table(None, [np.arange(6), TRANSLATIONS, QUATERNIONS, PIXELS])

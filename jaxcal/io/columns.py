@@ -68,7 +68,8 @@ SPELLINGS = {
     "px": ("pixel", "pixels"),
     "s": ("sec", "second", "seconds"),
     "ms": (),
-    "us": ("µs",),
+    # The micro sign, and the Greek letter that looks like it.
+    "us": ("\u00b5s", "\u03bcs"),
     "ns": (),
 }
 """Units as other programs write them."""
