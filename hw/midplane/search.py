@@ -42,7 +42,12 @@ _MOST = {
     "factor": 10.0,
 }
 """Of the others."""
-_LEAST = dict.fromkeys(("coarse_mm", "fine_mm", "finest_mm", "epsilon_mm"), 0.01)
+_LEAST: dict[str, float] = {
+    "coarse_mm": 0.01,
+    "fine_mm": 0.01,
+    "finest_mm": 0.01,
+    "epsilon_mm": 0.01,
+}
 """Of the steps: no robot makes shorter ones, and a raster of 1e-12 mm is more than any memory."""
 _POSITIVE = ("frames", "top_fraction", "most_moves", "full_scale", "factor")
 
