@@ -168,10 +168,11 @@ def _problem(recording: str | None, pixels: bool) -> Problem:
 
         return Problem.from_recording(load(recording))
     import numpy as np
-    from scipy.spatial.transform import Rotation
+
+    from jaxcal.data.poses import matrices_from_rotations, rotations_from_vectors
 
     draws = np.random.default_rng(0)
-    poses = np.tile(np.eye(4), (8, 1, 1))
-    poses[:, :3, :3] = Rotation.random(8, rng=draws).as_matrix()
+    turns = rotations_from_vectors(draws.normal(size=(8, 3)))
+    poses = matrices_from_rotations(turns, np.zeros((8, 3)))
     points = draws.uniform(10.0, 50.0, (8, 2))
     return Problem.from_arrays(poses, points, kind="pixel" if pixels else "point")

@@ -17,7 +17,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.data.poses import check_poses, matrices_from_rotations
+from jaxcal.data.poses import (
+    check_poses,
+    matrices_from_rotations,
+    rotations_from_vectors,
+    vectors_from_rotations,
+)
 from jaxcal.runtime.array_types import Bool, Float, Int
 from jaxcal.runtime.given_values import real_array
 from jaxcal.runtime.messages import seconds
@@ -116,9 +121,6 @@ def interpolate_poses(
         InputError: a time before the first pose or after the last, in a gap, or next to a pose
             that cannot be used; the time is named. :func:`can_interpolate` checks it beforehand.
     """
-    # It takes longer to import than all else that imports a table.
-    from scipy.spatial.transform import Rotation, Slerp
-
     times = _increasing(t, "time of pose")
     asked = _queries(query)
     if np.shape(poses)[:1] != times.shape:
@@ -134,10 +136,11 @@ def interpolate_poses(
     sound = check_poses(np.asarray(poses), None if valid is None else np.asarray(valid, bool))
     before = _interval(times, asked)
     first, second = sound[before], sound[before + 1]
-    share = (asked - times[before]) / (times[before + 1] - times[before])
-    turning = Slerp(times, Rotation.from_matrix(sound[:, :3, :3]))
-    moved = first[:, :3, 3] + share[:, None] * (second[:, :3, 3] - first[:, :3, 3])
-    return matrices_from_rotations(turning(asked).as_matrix(), moved)
+    share = ((asked - times[before]) / (times[before + 1] - times[before]))[:, None]
+    turn = vectors_from_rotations(np.swapaxes(first[:, :3, :3], 1, 2) @ second[:, :3, :3])
+    turned = first[:, :3, :3] @ rotations_from_vectors(share * turn)
+    moved = first[:, :3, 3] + share * (second[:, :3, 3] - first[:, :3, 3])
+    return matrices_from_rotations(turned, moved)
 
 
 def interpolation_error(
@@ -206,18 +209,16 @@ def pose_velocities(
     Raises:
         InputError: times out of order or not numbers, or poses that are not rigid.
     """
-    from scipy.spatial.transform import Rotation
-
     ends = np.stack([_queries(query) - VELOCITY_S, _queries(query) + VELOCITY_S])
     between = can_interpolate(t, ends.ravel(), max_gap_s=max_gap_s, valid=valid)
     known = between.reshape(ends.shape).all(axis=0)
     found = interpolate_poses(t, poses, ends[:, known].ravel(), max_gap_s=max_gap_s, valid=valid)
     before, after = found.reshape(2, -1, 4, 4)
-    turned = Rotation.from_matrix(np.swapaxes(before[:, :3, :3], 1, 2) @ after[:, :3, :3])
-    halfway = Rotation.from_matrix(before[:, :3, :3]) * Rotation.from_rotvec(turned.as_rotvec() / 2)
-    moved = halfway.inv().apply(after[:, :3, 3] - before[:, :3, 3])
+    turn = vectors_from_rotations(np.swapaxes(before[:, :3, :3], 1, 2) @ after[:, :3, :3])
+    halfway = before[:, :3, :3] @ rotations_from_vectors(turn / 2)
+    moved = np.einsum("mji,mj->mi", halfway, after[:, :3, 3] - before[:, :3, 3])
     velocity = np.full((ends.shape[1], 6), np.nan)
-    velocity[known] = np.hstack([moved, turned.as_rotvec()]) / (2 * VELOCITY_S)
+    velocity[known] = np.hstack([moved, turn]) / (2 * VELOCITY_S)
     return velocity
 
 

@@ -15,7 +15,12 @@ import h5py
 import numpy as np
 
 from jaxcal import FormatError, InputError
-from jaxcal.data.poses import check_affine, rotations_from_quaternions
+from jaxcal.data.poses import (
+    check_affine,
+    matrices_from_rotations,
+    rotations_from_quaternions,
+    rotations_from_vectors,
+)
 from jaxcal.io.atomic import write_bytes, write_text
 from jaxcal.io.given_files import check_readable, naming
 from jaxcal.io.lines import text_lines
@@ -67,19 +72,14 @@ def matrix_from_itk(
             "or a VersorRigid3D transform is"
         )
     centre = fixed[:3] if len(fixed) >= 3 else np.zeros(3)
-    stored = np.eye(4)
-    stored[:3, :3] = linear
-    stored[:3, 3] = translation + centre - linear @ centre
+    stored = matrices_from_rotations(linear, translation + centre - linear @ centre)
     if abs(np.linalg.det(linear)) < 1e-15:
         raise FormatError("the transform is singular")
     return _LPS @ np.linalg.inv(stored) @ _LPS + 0.0
 
 
 def _euler(angles: np.ndarray, fixed: np.ndarray) -> Float[np.ndarray, "3 3"]:
-    (cx, cy, cz), (sx, sy, sz) = np.cos(angles), np.sin(angles)
-    x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
-    y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
-    z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
+    x, y, z = rotations_from_vectors(np.diag(angles))
     # A fourth fixed parameter says that the order is ZYX.
     zyx = len(fixed) > 3 and fixed[3] != 0
     return z @ y @ x if zyx else z @ x @ y

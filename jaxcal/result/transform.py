@@ -24,7 +24,7 @@ from typing import Any, Literal
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.data.poses import check_affine, check_poses
+from jaxcal.data.poses import check_affine, check_poses, matrices_from_rotations
 from jaxcal.data.recording import LARGEST, check_spacing_unit
 from jaxcal.io.frame_names import FramePair, probe_name
 from jaxcal.io.given_files import naming
@@ -525,9 +525,8 @@ def transform_from_plus_matrix(
     # The nearest orthonormal pair, then y = z cross x.
     u, _, vt = np.linalg.svd(np.stack([lateral, axial], axis=1), full_matrices=False)
     lateral, axial = (u @ vt).T
-    transform = np.eye(4)
-    transform[:3, :3] = np.stack([lateral, np.cross(axial, lateral), axial], axis=1)
-    transform[:3, 3] = matrix[:3, 3]
+    turn = np.stack([lateral, np.cross(axial, lateral), axial], axis=1)
+    transform = matrices_from_rotations(turn, matrix[:3, 3])
     return ImageTransform(
         transform, scale, error_mm=error_mm, source=source, error_is_rms=error_mm is None
     )
