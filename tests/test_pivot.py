@@ -244,7 +244,7 @@ def test_bad_input_is_named():
 def test_too_few_poses_are_told_with_their_file(tmp_path, capsys):
     (tmp_path / "poses.txt").write_text("1 2 3 0 0 0 1\n")
     assert main(["pivot", str(tmp_path / "poses.txt"), "--quaternion", "xyzw"]) == 2
-    assert "poses.txt: 1 used poses are too few" in capsys.readouterr().err
+    assert "poses.txt: 1 used pose is too few" in capsys.readouterr().err
 
 
 def test_reading_poses(tmp_path):

@@ -41,6 +41,7 @@ from jaxcal.runtime.array_types import AnyArray
 from jaxcal.runtime.arrays import first_images, is_traced
 from jaxcal.runtime.given_values import check_flag, real_array, truth_array
 from jaxcal.runtime.jax_modes import in_own_modes, inside_transformation, require_float64
+from jaxcal.runtime.messages import counted
 from jaxcal.runtime.one_or_batch import OneOrBatch
 from jaxcal.solvers import dense
 from jaxcal.solvers.consensus import ConsensusModel, find_consensus, linearise, studentised_errors
@@ -255,9 +256,8 @@ def calibrate_pivot(
         if mask.sum() < MINIMUM_IMAGES:
             count, different = int(used.sum()), int(mask.sum())
             among = "" if different == count else f", {different} of them different,"
-            raise InputError(
-                f"{count} used poses{among} are too few: at least {MINIMUM_IMAGES} are needed"
-            )
+            few = f"{counted(count, 'used pose')}{among} {'is' if count == 1 else 'are'} too few"
+            raise InputError(f"{few}: at least {MINIMUM_IMAGES} are needed")
         reach = float(np.linalg.norm(poses[used, :3, 3], axis=1).max())
         if 0 < reach < LEAST_REACH_MM:
             raise MetresError(
