@@ -13,12 +13,12 @@ from collections import deque
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from hw.freehand.posed import PosedImage
 from hw.runtime.rigid import mean_pose, turn_deg
 from jaxcal import InputError
 from jaxcal.data.names import Target
+from jaxcal.data.poses import vectors_from_rotations
 from jaxcal.data.segmentation.image import localise
 from jaxcal.runtime.array_types import Float
 
@@ -253,13 +253,11 @@ class Guide:
 
 def orientation_sds(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, " 3"]:
     """SDs of orientations about their principal axes, degrees, the largest first."""
-    rotations = Rotation.from_matrix(poses[:, :3, :3])
-    turns = np.degrees((rotations.mean().inv() * rotations).as_rotvec())
+    turns = np.degrees(vectors_from_rotations(mean_pose(poses)[:3, :3].T @ poses[:, :3, :3]))
     return np.sqrt(np.maximum(np.linalg.eigvalsh(turns.T @ turns / len(turns))[::-1], 0.0))
 
 
 def spread_of(poses: Float[np.ndarray, "n 4 4"]) -> tuple[float, float]:
     """Largest distance (mm) and turn (degrees) from the newest pose."""
     shift = np.linalg.norm(poses[:, :3, 3] - poses[-1, :3, 3], axis=1).max()
-    turns = Rotation.from_matrix(poses[-1, :3, :3].T @ poses[:, :3, :3]).magnitude()
-    return float(shift), float(np.degrees(turns.max()))
+    return float(shift), max(turn_deg(pose, poses[-1]) for pose in poses)

@@ -9,6 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from jaxcal.data.poses import (
+    matrices_from_rotations,
+    nearest_rotations,
     rotation_angle,
     rotations_from_vectors,
     vectors_from_rotations,
@@ -39,20 +41,14 @@ def rigid(
     turn: Float[np.ndarray, "*n 3"], translation: Float[np.ndarray, "*n 3"]
 ) -> Float[np.ndarray, "*n 4 4"]:
     """Transforms of rotation vectors (rad) and translations (mm)."""
-    turn, translation = np.asarray(turn, float), np.asarray(translation, float)
-    matrix = np.zeros((*np.broadcast_shapes(turn.shape, translation.shape)[:-1], 4, 4))
-    matrix[..., :3, :3], matrix[..., :3, 3] = rotations_from_vectors(turn), translation
-    matrix[..., 3, 3] = 1.0
-    return matrix
+    turn, translation = np.broadcast_arrays(np.asarray(turn, float), translation)
+    return matrices_from_rotations(rotations_from_vectors(turn), translation)
 
 
 def mean_pose(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "4 4"]:
     """Mean position (mm) of poses near each other, and the rotation nearest to the mean matrix."""
-    u, _, vt = np.linalg.svd(poses[:, :3, :3].mean(axis=0))
-    pose = np.eye(4)
-    pose[:3, :3] = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    pose[:3, 3] = poses[:, :3, 3].mean(axis=0)
-    return pose
+    rotations, _ = nearest_rotations(poses[:, :3, :3].mean(axis=0, keepdims=True))
+    return matrices_from_rotations(rotations[0], poses[:, :3, 3].mean(axis=0))
 
 
 def straight_way(

@@ -11,7 +11,6 @@ from html import escape
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from hw.planning.poses import box_edges
 from hw.robot.kinematics import (
@@ -24,6 +23,7 @@ from hw.robot.kinematics import (
     nearest,
 )
 from hw.runtime.rigid import looking_rotation
+from jaxcal.data.poses import quaternions_from_rotations
 from jaxcal.runtime.array_types import Float, UInt8
 
 UNIT_MM = 100.0
@@ -56,7 +56,7 @@ _LEGEND = (
 
 def quaternion(rotation: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n 4"]:
     """Unit quaternions (w, x, y, z) of rotation matrices."""
-    return Rotation.from_matrix(rotation).as_quat(scalar_first=True)
+    return np.roll(quaternions_from_rotations(rotation), 1, axis=-1)
 
 
 def ellipsoid(
