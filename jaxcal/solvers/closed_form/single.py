@@ -35,7 +35,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxcal.data.poses import matrices_from_rotations, rotations_from_quaternions
+from jaxcal.data.poses import rotations_from_quaternions
 from jaxcal.data.problem import Problem
 from jaxcal.model.unknowns import Blocks
 from jaxcal.runtime.array_types import Bool, Float, HeldArray
@@ -451,11 +451,13 @@ def _assemble(
     if scaled:
         # The offset of the face is part of t so far.
         origin = origin - data.face_offset * r3
-    turn = np.stack([r1, np.cross(r3, r1), r3], axis=1)
+    transform = np.eye(4)
+    transform[:3, :3] = np.stack([r1, np.cross(r3, r1), r3], axis=1)
+    transform[:3, 3] = origin
     scale = data.spacing * lengths if scaled else data.spacing
     speed = float(lengths[1]) if reduced.constraints.free == ("axial",) else 1.0
     return ClosedForm(
-        image_to_probe=matrices_from_rotations(turn, origin),
+        image_to_probe=transform,
         point=point,
         scale_mm_per_px=scale if data.pixels else None,
         sound_speed_factor=speed,
