@@ -24,10 +24,12 @@ added to both sums.
 *Slow paths.* Where the probe was placed anew for every image, errors have little reason to stay
 alike for long. Where it moved slowly all the time, whatever depends on its motion did so, too, and
 few images along such a path cannot tell a drift from a movement. Offsets that follow the movement
-change about as quickly as the probe does. So most of the grid has spectra that are flat up to a
-cut-off near the path's own frequency and fall steeply behind it. (A grid of all periods from a few
-images on gives most of the prior to errors that would be seen, and too little to those that the fit
-absorbs.) The share of this grid in the prior follows from the size of the steps (:func:`slowness`).
+change about as quickly as the probe does. So there is another grid for such paths, and most of it
+has spectra that are flat up to a cut-off near the path's own frequency and fall steeply behind it.
+(A grid of all periods from a few images on gives most of the prior to errors that would be seen,
+and too little to those that the fit absorbs.) The rest of it has correlations of the usual kind,
+but of times up to a third of the recording. The share of this grid in the prior follows from the
+size of the steps (:func:`slowness`).
 
 The cosine transform of a stationary series has nearly independent coefficients, whose variances are
 the spectral density. So no matrix of all images is formed: C_k is diagonal there.
@@ -65,6 +67,10 @@ PERIODS, LONGEST_PERIOD = (0.7, 1.0, 1.4, 2.0), 2.0
 """Periods at the cut-off of errors that follow the movement, relative to its own, and the longest
 one relative to the number of images, that of the slowest wave. (What does not change at all is the
 mean of the errors, whose doubt is included elsewhere.)"""
+
+SHORTEST_PERIOD, OTHER_PERIODS = 4.0, 9
+"""Along a slow path: the shortest period (images) of errors that do not follow the movement, and
+the number of periods from this one to the longest one."""
 
 ORDER = 16
 """Power of the squared frequency by which these spectra fall behind the cut-off."""
@@ -231,23 +237,21 @@ def _models(
     count: int, slow: float, period: float
 ) -> tuple[Float[np.ndarray, "g n"], Float[np.ndarray, " g"]]:
     """Variances of the cosine transform of errors with variance 1, and the prior of each model."""
-    following = FOLLOWING * slow
-    usual = slow - following + (1 - slow) * (count >= FEWEST_SUCCESSIVE)
-    alike = 1 - INDEPENDENT
-    spectra = [np.ones((1, count))]
-    belief = [np.array([1 - alike * (usual + following)])]
-    if usual > 0:
-        spectra.append(_usual_spectra(count))
-        belief.append(_evenly(alike * usual, spectra[-1]))
-    if following > 0:
-        spectra.append(_following_spectra(count, period))
-        belief.append(_evenly(alike * following, spectra[-1]))
+    grids = []
+    if slow < 1 and count >= FEWEST_SUCCESSIVE:
+        grids.append((1 - slow, _usual_spectra(count)))
+    if slow > 0:
+        longest = LONGEST_PERIOD * count
+        own = np.minimum(period * np.array(PERIODS), longest)
+        grids.append((FOLLOWING * slow, _partly(_low_pass(count, own, ORDER), FOLLOWING_SHARES)))
+        others = np.geomspace(SHORTEST_PERIOD, longest, OTHER_PERIODS)
+        grids.append(((1 - FOLLOWING) * slow, _partly(_low_pass(count, others, 1), SHARES)))
+    spectra, belief = [np.ones((1, count))], [np.ones(1)]
+    for share, grid in grids:
+        spectra.append(grid)
+        belief.append(np.full(len(grid), (1 - INDEPENDENT) * share / len(grid)))
+        belief[0] -= belief[-1].sum()
     return np.concatenate(spectra), np.concatenate(belief)
-
-
-def _evenly(belief: float, spectra: Float[np.ndarray, "g n"]) -> Float[np.ndarray, " g"]:
-    """A prior probability, spread evenly over models."""
-    return np.full(len(spectra), belief / len(spectra))
 
 
 def _usual_spectra(count: int) -> Float[np.ndarray, "g n"]:
@@ -256,14 +260,12 @@ def _usual_spectra(count: int) -> Float[np.ndarray, "g n"]:
     return _partly(1 / (1 + rho**2 - 2 * rho * np.cos(_frequencies(count))), SHARES)
 
 
-def _following_spectra(count: int, period: float) -> Float[np.ndarray, "g n"]:
-    """Flat up to a cut-off, where they have fallen to half."""
-    periods = np.minimum(period * np.array(PERIODS), LONGEST_PERIOD * count)
+def _low_pass(count: int, periods: Float[np.ndarray, " r"], order: int) -> Float[np.ndarray, "r n"]:
+    """Flat up to a cut-off, where they have fallen to half; periods in images."""
     cut_off = np.sin(np.pi / periods)[:, None] ** 2
     above = np.sin(0.5 * _frequencies(count)) ** 2 / cut_off
-    # Of order 1 it would be that of rho^|i - j|; this is that of so many filters one after another.
-    density = (1 + (2 ** (1 / ORDER) - 1) * above) ** -float(ORDER)
-    return _partly(density, FOLLOWING_SHARES)
+    # Of order 1 it is that of rho^|i - j|; of others, of so many filters one after another.
+    return (1 + (2 ** (1 / order) - 1) * above) ** -float(order)
 
 
 def _frequencies(count: int) -> Float[np.ndarray, " n"]:

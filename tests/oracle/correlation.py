@@ -33,13 +33,16 @@ def widened(
     """
     if errors.shape[1] < FEWEST_IMAGES:
         return covariance
-    following = 0.0 if path is None else FOLLOWING * slowness(*path)
+    slow = 0.0 if path is None else slowness(*path)
     models = _models(errors.shape[1])
-    prior = [0.5] + [0.5 * (1 - following) / (len(models) - 1)] * (len(models) - 1)
-    if path is not None and following > 0:
-        slow = _following(errors.shape[1], period(*path))
-        models = models + slow
-        prior = prior + [0.5 * following / len(slow)] * len(slow)
+    prior = [0.5] + [0.5 * (1 - slow) / (len(models) - 1)] * (len(models) - 1)
+    if path is not None and slow > 0:
+        for share, further in (
+            (FOLLOWING, _following(errors.shape[1], period(*path))),
+            (1 - FOLLOWING, _others(errors.shape[1])),
+        ):
+            models = models + further
+            prior = prior + [0.5 * slow * share / len(further)] * len(further)
     sizes = np.ones(3) if variances is None else variances
     # Turned by a rotation. In it covariances are diagonal, so that small variances are exact.
     cosines = dct(np.eye(errors.shape[1]), axis=0, norm="ortho")
@@ -102,6 +105,17 @@ def _following(count: int, period: float) -> list[np.ndarray]:
             power.append((1 + (2 ** (1 / 16) - 1) * ratio) ** -16)
         correlated = np.diag(power / np.mean(power))
         found += [(1 - share) * np.eye(count) + share * correlated for share in FOLLOWING_SHARES]
+    return found
+
+
+def _others(count: int) -> list[np.ndarray]:
+    """Of first order, which have fallen to half at periods from 4 to twice the number of images."""
+    found = []
+    for step in range(9):
+        at = 2 * np.pi / (4 * (count / 2) ** (step / 8))
+        power = [1 / (1 + (1 - np.cos(np.pi * k / count)) / (1 - np.cos(at))) for k in range(count)]
+        correlated = np.diag(power / np.mean(power))
+        found += [(1 - share) * np.eye(count) + share * correlated for share in SHARES]
     return found
 
 
