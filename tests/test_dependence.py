@@ -243,7 +243,7 @@ def _good_and_wrong(made) -> tuple[bool, bool]:
     return True, bool(error > record["tre"]["interval_95_mm"][1])
 
 
-@pytest.mark.parametrize(("count", "step_s", "most"), [(15, 0.5, 2), (30, 0.5, 1), (100, 0.05, 2)])
+@pytest.mark.parametrize(("count", "step_s", "most"), [(15, 0.5, 1), (30, 0.5, 1), (100, 0.05, 1)])
 def test_a_smooth_sweep_is_seldom_good_and_wrong(frames, count, step_s, most):
     """Its offsets change as slowly as its poses. Without such models 9, 5 and 6 were."""
     made = [frames.smooth(count, step_s, np.random.default_rng([3, k])) for k in range(20)]
@@ -267,10 +267,13 @@ def test_a_slow_path_is_believed_where_offsets_were_drawn_anew(frames):
 
 
 def test_a_longer_smooth_sweep_is_believed(frames):
-    """With powers of the frequency as the only spectra, two of these were, and 5 mm expected."""
+    """With powers of the frequency as the only spectra, two of these were, and 5 mm expected.
+
+    With the size of the errors taken as known, nine were. It is known from six values here.
+    """
     made = [frames.smooth(60, 0.5, np.random.default_rng([6, k])) for k in range(12)]
     good, wrong = np.sum([_good_and_wrong(one) for one in made], axis=0)
-    assert good >= 9
+    assert good >= 7
     assert wrong <= 1
 
 

@@ -31,12 +31,18 @@ and too little to those that the fit absorbs.) The rest of it has correlations o
 but of times up to a third of the recording. The share of this grid in the prior follows from the
 size of the steps (:func:`slowness`).
 
+Errors without frequencies above 1/P have about 2 n/P degrees of freedom in n images, with P in
+images, however many these are. So after one or two periods of the movement the size of errors that
+follow it is known from few values, as an SD from few measurements, and Student's t has to take the
+place of the normal law. Their variance grows by the square of the ratio of both quantiles, in
+proportion to the weight of their models.
+
 The cosine transform of a stationary series has nearly independent coefficients, whose variances are
 the spectral density. So no matrix of all images is formed: C_k is diagonal there.
 
 References: Patterson and Thompson 1971 (restricted likelihood); White 1980 and Liang and Zeger 1986
 (covariances under dependent errors); Ahmed, Natarajan and Rao 1974 (cosine transform of such
-series).
+series); Slepian 1983 (degrees of freedom of band-limited series); Student 1908.
 """
 
 from __future__ import annotations
@@ -209,10 +215,10 @@ def _covariances(
     """
     errors, rows, prior = whitened.errors, whitened.rows, np.diag(precision)
     inverse, before = whitened.covariances(precision)
-    spectra, belief = _models(len(errors), slow, period)
+    spectra, belief, doubt = _models(len(errors), slow, period)
     waves = _cosine_transform(np.concatenate([rows, errors[..., None]], axis=2))
     middle = prior
-    for k, factor in enumerate(_factors(waves, spectra, belief, prior)):
+    for k, factor in enumerate(_factors(waves, spectra, belief, doubt, prior)):
         along = waves[:, k, :-1]
         middle = middle + whitened.variances[k] * (along.T * (factor @ spectra)) @ along
     lower = _lower(before)
@@ -235,23 +241,41 @@ def _cosine_transform(values: Float[np.ndarray, "n k q"]) -> Float[np.ndarray, "
 
 def _models(
     count: int, slow: float, period: float
-) -> tuple[Float[np.ndarray, "g n"], Float[np.ndarray, " g"]]:
-    """Variances of the cosine transform of errors with variance 1, and the prior of each model."""
+) -> tuple[Float[np.ndarray, "g n"], Float[np.ndarray, " g"], Float[np.ndarray, " g"]]:
+    """Variances of the cosine transform of errors with variance 1, for each model.
+
+    Returns:
+        Besides, the models' prior probabilities, and the shares by which their variance grows since
+        it is known from few values.
+    """
     grids = []
     if slow < 1 and count >= FEWEST_SUCCESSIVE:
-        grids.append((1 - slow, _usual_spectra(count)))
+        grids.append((1 - slow, 0.0, _usual_spectra(count)))
     if slow > 0:
         longest = LONGEST_PERIOD * count
         own = np.minimum(period * np.array(PERIODS), longest)
-        grids.append((FOLLOWING * slow, _partly(_low_pass(count, own, ORDER), FOLLOWING_SHARES)))
+        following = _partly(_low_pass(count, own, ORDER), FOLLOWING_SHARES)
+        grids.append((FOLLOWING * slow, _known_from(2 * count / period), following))
         others = np.geomspace(SHORTEST_PERIOD, longest, OTHER_PERIODS)
-        grids.append(((1 - FOLLOWING) * slow, _partly(_low_pass(count, others, 1), SHARES)))
-    spectra, belief = [np.ones((1, count))], [np.ones(1)]
-    for share, grid in grids:
+        grids.append(((1 - FOLLOWING) * slow, 0.0, _partly(_low_pass(count, others, 1), SHARES)))
+    spectra, belief, doubt = [np.ones((1, count))], [np.ones(1)], [np.zeros(1)]
+    for share, grows, grid in grids:
         spectra.append(grid)
         belief.append(np.full(len(grid), (1 - INDEPENDENT) * share / len(grid)))
+        doubt.append(np.full(len(grid), grows))
         belief[0] -= belief[-1].sum()
-    return np.concatenate(spectra), np.concatenate(belief)
+    return np.concatenate(spectra), np.concatenate(belief), np.concatenate(doubt)
+
+
+def _known_from(freedom: float) -> float:
+    """The share by which a variance grows that is known from so many values, at least one."""
+    # scipy.special takes longer to import than a calibration of poses at random.
+    from scipy import special
+
+    from jaxcal.diagnostics.intervals import LEVEL
+
+    end = 0.5 + 0.5 * LEVEL
+    return float((special.stdtrit(max(freedom, 1.0), end) / special.ndtri(end)) ** 2 - 1)
 
 
 def _usual_spectra(count: int) -> Float[np.ndarray, "g n"]:
@@ -286,6 +310,7 @@ def _factors(
     waves: Float[np.ndarray, "n 3 q"],
     spectra: Float[np.ndarray, "g n"],
     belief: Float[np.ndarray, " g"],
+    doubt: Float[np.ndarray, " g"],
     prior: Float[np.ndarray, "p p"],
 ) -> Float[np.ndarray, "3 g"]:
     """Weight of every model times the variance under it, for every kind of error.
@@ -294,6 +319,7 @@ def _factors(
         waves: cosine transforms of the unknowns' rows and, last, of the errors.
         spectra: of all models of the correlation.
         belief: their prior probabilities.
+        doubt: shares by which their variances grow, in proportion to the weight of such models.
         prior: (q - 1, q - 1) information about the unknowns.
 
     Returns:
@@ -333,6 +359,7 @@ def _factors(
             twice += 2 * variance[k] / (PRIOR_VARIANCE * variance[k][0])
             likelihood = belief * np.exp(-0.5 * (twice - twice.min()))
             weight[k] = likelihood / likelihood.sum()
+    variance *= 1 + doubt * (weight @ (doubt > 0))[:, None]
     return weight * variance / variance[:, :1]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.fft import dct
+from scipy.stats import norm, t
 
 CORRELATIONS = [0.04 + 0.08 * k for k in range(12)]
 SHARES = (1 / 3, 2 / 3, 1.0)
@@ -36,6 +37,8 @@ def widened(
     slow = 0.0 if path is None else slowness(*path)
     models = _models(errors.shape[1])
     prior = [0.5] + [0.5 * (1 - slow) / (len(models) - 1)] * (len(models) - 1)
+    follows = slice(len(models), len(models) + 4 * len(FOLLOWING_SHARES))
+    doubt = 0.0
     if path is not None and slow > 0:
         for share, further in (
             (FOLLOWING, _following(errors.shape[1], period(*path))),
@@ -43,13 +46,16 @@ def widened(
         ):
             models = models + further
             prior = prior + [0.5 * slow * share / len(further)] * len(further)
+        freedom = max(1.0, 2 * errors.shape[1] / period(*path))
+        doubt = (t.ppf(0.975, freedom) / norm.ppf(0.975)) ** 2 - 1
     sizes = np.ones(3) if variances is None else variances
     # Turned by a rotation. In it covariances are diagonal, so that small variances are exact.
     cosines = dct(np.eye(errors.shape[1]), axis=0, norm="ortho")
     along, errors = np.einsum("mn,knp->kmp", cosines, along), errors @ cosines.T
     inverse = np.linalg.inv(np.einsum("knp,knq->pq", along, along))
     before = inverse @ np.einsum("k,knp,knq->pq", sizes, along, along) @ inverse
-    expected = zip(sizes, along, _expected(models, np.array(prior), along, errors), strict=True)
+    found = _expected(models, np.array(prior), along, errors, follows, doubt)
+    expected = zip(sizes, along, found, strict=True)
     after = inverse @ sum(v * j.T @ c @ j for v, j, c in expected) @ inverse
     # It makes no direction more certain: symmetric square roots, then eigenvalues of at least 1.
     values, vectors = np.linalg.eigh(before)
@@ -120,9 +126,17 @@ def _others(count: int) -> list[np.ndarray]:
 
 
 def _expected(
-    models: list[np.ndarray], prior: np.ndarray, along: np.ndarray, errors: np.ndarray
+    models: list[np.ndarray],
+    prior: np.ndarray,
+    along: np.ndarray,
+    errors: np.ndarray,
+    follows: slice,
+    doubt: float,
 ) -> list[np.ndarray]:
-    """The expected covariance of every kind of error, in units of its variance if independent."""
+    """The expected covariance of every kind of error, in units of its variance if independent.
+
+    The variance under the models of errors that follow the movement grows by the doubt about it.
+    """
     kinds, count, _ = along.shape
     inverses = [np.linalg.inv(model) for model in models]
     variance = np.ones((kinds, len(models)))
@@ -159,6 +173,7 @@ def _expected(
             weight[k] = prior * np.exp(-0.5 * (twice - twice.min()))
             weight[k] /= weight[k].sum()
     by = weight * variance / variance[:, :1]
+    by[:, follows] *= 1 + doubt * weight[:, follows].sum(axis=1, keepdims=True)
     return [np.einsum("g,gij->ij", each, models) for each in by]
 
 
