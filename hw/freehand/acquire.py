@@ -24,6 +24,7 @@ from hw.ultrasound.receiver import UltrasoundStream
 from jaxcal import CalibrationError
 from jaxcal.data.recording import Recording, make_images
 from jaxcal.data.segmentation.image import check_region
+from jaxcal.runtime.messages import first_ones
 
 _KIND = "free-hand"
 _LEAST_FOR_ESTIMATE = 6
@@ -179,7 +180,7 @@ def agreement(taken: Sequence[Taken], spacing_mm: tuple[float, float] | None) ->
 def _found(posed: PosedImages) -> list[str]:
     lines = [
         f"images of {posed.device!r}; poses from {posed.pair[0]} to {posed.pair[1]} (--from and "
-        f"--to choose others; the stream has {', '.join(posed.names)})"
+        f"--to choose others; the stream has {first_ones(posed.names)})"
     ]
     if posed.by_arrival:
         lines.append(

@@ -24,6 +24,7 @@ from jaxcal.data.poses import inverse_poses
 from jaxcal.data.timing import interpolate_poses
 from jaxcal.io.frame_names import FramePair, capitalised, path_between, split_name
 from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.messages import first_ones
 
 LISTEN_S = 5.0
 """How long to wait for the first image and the first transform."""
@@ -117,7 +118,7 @@ class PosedImages:
         self.pair = _chosen(pairs, source, target)
         self._steps = path_between(list(pairs.values()), *self.pair) or []
         if not self._steps:
-            known = ", ".join(self.names)
+            known = first_ones(self.names)
             raise DeviceError(
                 f"no transforms lead from {self.pair[0]} to {self.pair[1]}; the stream has {known}",
                 device="tracker",
@@ -321,7 +322,7 @@ def _chosen(pairs: dict[str, FramePair], source: str | None, target: str | None)
     if start is None:
         start = "Probe" if "Probe" in tools else tools[0] if len(tools) == 1 else None
     if start is None:
-        known = ", ".join(tools) or "none"
+        known = first_ones(tools) or "none"
         raise DeviceError(
             f"name the tracked frame on the probe (--from); there are {known}", device="tracker"
         )

@@ -127,7 +127,7 @@ def parse_header(data: bytes | bytearray | memoryview) -> Header | None:
     if size > _LARGEST.get(text, MAXIMUM_BODY):
         return None
     stamp = seconds + fraction * 2.0**-32
-    return Header(version, text, device.decode("utf-8", "replace"), stamp or math.nan, size, crc)
+    return Header(version, text, _text(device), stamp or math.nan, size, crc)
 
 
 BEGINNING = _EXTENDED.size + _IMAGE.size

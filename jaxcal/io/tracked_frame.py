@@ -26,6 +26,7 @@ from jaxcal.io.frame_names import split_name
 from jaxcal.io.grey import grey_of, oriented
 from jaxcal.io.message_content import ContentError, Picture, Tracked, TrackedFrame
 from jaxcal.io.xml import parse_xml
+from jaxcal.runtime.messages import quoted
 
 _HEAD = struct.Struct(">HHH3HIIH64s")
 _UINT8 = 3
@@ -35,6 +36,7 @@ _ORIENTATIONS = {0: "MF", 1: "UF", 2: "UF", 3: "UN", 4: "UN", 5: "MF", 6: "MF", 
 _MF = 5
 _MOST_XML = 2**18
 _MOST_TRANSFORMS = 256
+_LONGEST_NAME = 100
 _TRANSFORM, _STATUS = "Transform", "TransformStatus"
 
 
@@ -107,6 +109,8 @@ def _transforms(xml: bytes) -> tuple[Tracked, ...]:
         name = field.removesuffix(_TRANSFORM)
         if name == field or split_name(name) is None:
             continue
+        if len(name) > _LONGEST_NAME or not name.isprintable():
+            raise ContentError(f"a tracked frame with a transform named {quoted(name)}")
         found.append(Tracked(name, _matrix(text.split()), fields.get(name + _STATUS, "")))
         if len(found) > _MOST_TRANSFORMS:
             raise ContentError(f"a tracked frame with more than {_MOST_TRANSFORMS} transforms")

@@ -151,6 +151,13 @@ def test_what_pyigtl_does_not_know() -> None:
     assert decode(encode(message))[0].content == message.content
 
 
+def test_names_do_not_command_the_terminal_that_shows_them() -> None:
+    """Half of what a control sequence needs passed as UTF-8."""
+    (message,) = decode(encode(Message("TRANSFORM", "A\x9b2JToB", 1.0, (Tracked("", np.eye(4)),))))
+    assert message.device == "A?2JToB"
+    assert message.content[0].name == "A?2JToB"  # type: ignore[index]
+
+
 def test_pixels_cannot_be_written() -> None:
     (message,) = decode(encode(image(1, np.random.default_rng(0))))
     assert isinstance(message.content, Picture)

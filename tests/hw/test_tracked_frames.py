@@ -104,6 +104,8 @@ def test_orientations_become_mf(code, flip):
         (body(xml=XML[:-20]), "is not XML"),
         (body(xml=XML.replace("0 -1 0", "0 -1")), "not 16 numbers"),
         (body(xml=XML.replace("0 -1 0", "0 x 0")), "not 16 numbers"),
+        (body(xml=XML.replace("Stylus", "Sty&#x9b;2J")), r"transform named 'Sty\x9b2JToTracker'"),
+        (body(xml=XML.replace("Stylus", 100 * "S")), "transform named 'SSSS"),
         (body(xml='<!DOCTYPE a [<!ENTITY b "c">]>' + XML), "document types"),
         (b"", "cut off"),
     ],
