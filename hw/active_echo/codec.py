@@ -298,6 +298,8 @@ class Decoder:
 
     def _accept_reply(self, text: str) -> Reply:
         self._good()
+        # A person reads it at a terminal, which obeys control characters.
+        text = "".join(letter if letter.isprintable() else "?" for letter in text)
         word, _, value = text.partition(" ")
         if word == "STRM":
             self.mode = {"ON": Mode.BINARY, "OFF": Mode.TEXT}.get(value, self.mode)

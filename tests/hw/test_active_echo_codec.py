@@ -101,6 +101,13 @@ def test_what_a_person_types_needs_no_crc() -> None:
         encode_line("THR\n5")
 
 
+def test_an_answer_does_not_command_the_terminal_that_shows_it() -> None:
+    """``jaxcal-hw check`` cleared the screen, and set its title, where an identity said so."""
+    text = "*IDN? A\x1b[2J\x07\nB"
+    decoder = Decoder(Mode.BINARY)
+    assert decoder.feed(encode_reply(text)) == [Reply("*IDN?", "A?[2J??B")]
+
+
 def test_modes_follow_the_replies() -> None:
     """Lines, then frames from STRM ON to STRM OFF, then lines; in one portion or byte by byte."""
     rng = np.random.default_rng(1)
