@@ -7,7 +7,7 @@ flange to the pose (:mod:`hw.robot.kinematics`).
 
 from __future__ import annotations
 
-from html import escape
+import re
 from typing import Any
 
 import numpy as np
@@ -345,7 +345,7 @@ def state_words(told: dict[str, Any]) -> str:
         first += f", {len(told['given_up'])} given up"
     lines = [first]
     if told.get("trouble"):
-        lines.append(f"**{told['trouble']}**")
+        lines.append(f"**{_as_it_is(told['trouble'])}**")
     if told.get("stop") is not None:
         offset, amplitude, threshold = told["stop"]
         lines.append(f"search: {offset:+.2f} mm, amplitude {amplitude:.0f}, threshold {threshold}")
@@ -358,8 +358,13 @@ def state_words(told: dict[str, Any]) -> str:
 def estimate_words(told: dict[str, Any]) -> str:
     """The running estimate and what was said last, as markdown."""
     lines = _estimate_words(told.get("estimate"))
-    lines += [f"<small>{escape(line)}</small>" for line in told["said"][-2:]]
+    lines += [f"<small>{_as_it_is(line)}</small>" for line in told["said"][-2:]]
     return "\n\n".join(lines)
+
+
+def _as_it_is(text: str) -> str:
+    """Text in markdown: a browser would load what a device that is named ``![](http:...)`` says."""
+    return re.sub(r"[^\w\s]|_", lambda sign: f"&#{ord(sign[0])};", text)
 
 
 def _estimate_words(estimate: dict[str, Any] | None) -> list[str]:

@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
+from html import unescape
 from http.client import HTTPConnection
 from pathlib import Path
 
@@ -42,7 +43,7 @@ from hw.runtime.rigid import looking_rotation
 from hw.setup.description import Setup
 from hw.setup.emulated import setup_of, start
 from hw.view.feed import LiveView, halved, watched
-from hw.view.page import Page, ellipsoid, state_words, to_scale
+from hw.view.page import Page, ellipsoid, estimate_words, state_words, to_scale
 from hw.view.server import ignore_browsers
 from jaxcal.data.probe import LinearProbe
 
@@ -261,6 +262,18 @@ def test_a_page_of_another_site_cannot_read_it(shared_view):
         connect(url, subprotocols=protocol, origin="http://evil.example")  # type: ignore
     with connect(url, subprotocols=protocol, origin=view.url) as socket:  # type: ignore
         assert isinstance(socket.recv(timeout=180.0), bytes)
+
+
+def test_what_is_said_is_no_markdown():
+    """Electronics that named themselves so had the browser ask another machine for a picture."""
+    said = "![a_b](http://192.0.2.7/p.png) <i>"
+    words = estimate_words({"said": [said]}).split("\n\n")[-1]
+    shown = words.removeprefix("<small>").removesuffix("</small>")
+    assert not set(shown) & set("![]()_<>:/")
+    assert unescape(shown) == said
+    told = {"done": [], "images": 4, "given_up": [], "trouble": said}
+    assert unescape(state_words(told).split("\n\n")[-1]) == f"**{said}**"
+    assert said not in state_words(told)
 
 
 def test_the_extra_is_named_where_viser_is_missing():
