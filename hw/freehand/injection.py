@@ -66,6 +66,8 @@ _RECENT = 32
 _SHOW_PERIOD_S = 0.1
 _KEPT_S = 60.0
 """Older samples of a sweep are dropped, because the hand's drift would blur the maximum."""
+_GONE_S = 0.3
+"""A probe that is not tracked, or moved too fast, has no samples: after so long it is elsewhere."""
 _BESIDE_MM = 1.0
 """A place farther from the maximum than this is not accepted."""
 
@@ -346,8 +348,10 @@ class _Run(Run):
             return "visit both sides first: the bar must shrink on each"
         rules, last_s = self.asked.rules, self._samples[-1].frame.t_host
         held = [s for s in self._samples if last_s - s.frame.t_host <= rules.hold_s]
-        if last_s - held[0].frame.t_host < 0.8 * rules.hold_s:
-            return f"hold still for {rules.hold_s:g} s, then accept"
+        newest = self._images[-1]
+        gone = self._hurried or newest.image.prompt_s - last_s > _GONE_S
+        if gone or last_s - held[0].frame.t_host < 0.8 * rules.hold_s:
+            return newest.why or f"hold still for {rules.hold_s:g} s, then accept"
         shift, turn = spread_of(np.array([sample.pose for sample in held]))
         if shift > rules.still_mm or turn > rules.still_deg:
             return f"the probe moved ({shift:.1f} mm, {turn:.1f} degrees): hold still, then accept"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import threading
 import time
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -18,13 +19,14 @@ from echo_bridge import Bridge
 pytest.importorskip("serial", reason="pyserial is not installed (jaxcal[serial])")
 
 import jaxcal
+from hw.active_echo.device import EchoFrame
 from hw.bench.active_echo import AuspisEmulator
 from hw.bench.frames import Camera
 from hw.bench.ultrasound import ImageServer
 from hw.bench.world import make_world
 from hw.cli.main import main
 from hw.freehand.guide import Rules
-from hw.freehand.injection import acquire_by_injection, hand_advice
+from hw.freehand.injection import Sample, _Run, acquire_by_injection, hand_advice
 from hw.freehand.posed import PosedImage, pose_at_arrival
 from hw.freehand.request import FreeHand, FreeHandStopped
 from hw.midplane.pattern_injection import View
@@ -291,6 +293,34 @@ def test_enter_is_refused_until_both_sides_were_seen(tmp_path, bench):
     Recorder(tmp_path / "o.h5", RecordingHeader("pixel", {}, 0, settings="{}")).close()
     with pytest.raises(InputError, match="has no settings of a pattern-injection run"):
         acquire_by_injection(tmp_path / "o.h5", bench.asked, bench.setup, person, resume=True)
+
+
+def test_enter_is_refused_where_the_probe_is_no_longer(bench, monkeypatch):
+    """The place where it had been held was accepted, with a frame of where it was by then."""
+    run, kept = object.__new__(_Run), []
+    run.asked, run.setup, run._images = bench.asked, bench.setup, deque()
+    run._new_sweep()
+    monkeypatch.setattr(_Run, "_keep", lambda run, held, bracket, where: kept.append(where))
+    offsets = np.concatenate([np.linspace(-4, 4, 60), np.zeros(30)])
+    ticks = np.zeros(8, np.uint16)
+    for number, offset in enumerate(offsets):
+        frame = EchoFrame(number, 0, 0, ticks, ticks, t_host=number / 30, tof_s=np.zeros(8))
+        peak = 3000 * np.exp(-0.5 * (offset / 1.5) ** 2)
+        run._samples.append(Sample(frame, np.eye(4), offset, peak))
+    last_s = run._samples[-1].frame.t_host
+
+    def press(later_s: float, why: str = "") -> str:
+        image = Image(last_s + later_s, 0.0, 0, np.zeros((2, 2), np.uint8), (1.0, 1.0), "")
+        run._images.append(PosedImage(image, 0.0, None if why else np.eye(4), why))
+        return run._accept()
+
+    assert press(1.0, "Probe is not tracked") == "Probe is not tracked"
+    run._hurried = True
+    assert press(0.1) == "hold still for 0.3 s, then accept"
+    run._hurried = False
+    assert not kept
+    assert press(0.1) == ""
+    assert kept == [0.0]
 
 
 def test_poses_in_metres_are_told_of(tmp_path, bench):
