@@ -144,7 +144,8 @@ STATIC = ("plan", "test", "truth")
 """Groups of arrays that are written once."""
 
 FRAME_TYPES = ("uint8", "int16")
-LARGEST_ROW = 2**24
+LARGEST_ROW = 2**25
+"""Bytes; no image of a stream is larger."""
 
 
 @dataclass(frozen=True)

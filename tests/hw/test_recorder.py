@@ -573,6 +573,17 @@ def test_files_that_are_not_resumed(tmp_path):
         spoil(change)
 
 
+def test_a_recording_of_large_images_is_resumed(tmp_path):
+    """Images of more than 16 MiB were recorded, and the file was then refused."""
+    path, one = tmp_path / "rec.h5", np.ones(1)
+    writer = RecordingWriter.create(path, HEADER)
+    frames = np.zeros((1, 4200, 4200), np.uint8)
+    writer.append("us", {"t_host": one, "t_device": one, "frame_id": one, "frames": frames})
+    writer.close()
+    assert frames.nbytes > 2**24
+    assert RecordingWriter.resume(path).rows["us"] == 1
+
+
 def test_a_host_time_that_cannot_be_is_not_gone_on_from(tmp_path):
     """All times of the resumed run were infinite."""
     path = tmp_path / "rec.h5"
