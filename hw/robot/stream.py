@@ -163,8 +163,12 @@ class PoseStream:
         self._thread.start()
         # Starting an interpreter takes seconds on a busy machine; that is not the robot's fault.
         patience = self._timeout + 20.0
-        with self._lock:
-            come = self._condition.wait_for(lambda: self._latest or self._error, patience)
+        try:
+            with self._lock:
+                come = self._condition.wait_for(lambda: self._latest or self._error, patience)
+        except BaseException:
+            self.close()
+            raise
         if not come or self._error:
             self.close()
             error = self._error or f"no pose from {self.host} within {patience:g} s"

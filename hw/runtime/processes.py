@@ -36,10 +36,18 @@ def spawn(
 
 
 def first_line(process: subprocess.Popen[bytes], patience_s: float) -> bytes:
-    """The first line of a process's output; empty where none comes within so many wall s."""
+    """The first line of a process's output; empty where none comes within so many wall s.
+
+    An interrupt ends the process: nobody else would, as long as this one goes on.
+    """
     assert process.stdout is not None
-    ready = select.select([process.stdout], [], [], patience_s)[0]
-    return process.stdout.readline() if ready else b""
+    try:
+        ready = select.select([process.stdout], [], [], patience_s)[0]
+        return process.stdout.readline() if ready else b""
+    except BaseException:
+        process.kill()
+        process.communicate()
+        raise
 
 
 def finish(process: subprocess.Popen[bytes], patience_s: float) -> bool:

@@ -6,6 +6,7 @@ import gc
 import os
 import re
 import signal
+import socket
 import sys
 import threading
 import time
@@ -16,9 +17,12 @@ import numpy as np
 import pytest
 
 from hw.cli.confirming import typed_code
+from hw.robot.rtde import PORT
+from hw.robot.stream import PoseStream
 from hw.runtime import interrupts
 from hw.runtime.interrupts import as_interrupts, heed_interrupt
 from hw.runtime.keys import Pause
+from hw.runtime.processes import first_line, spawn
 from hw.ultrasound.receiver import UltrasoundStream
 
 pytestmark = pytest.mark.skipif(
@@ -38,6 +42,23 @@ def collecting(phase: str, info: dict) -> None:
     """A callback of the garbage collector that is interrupted."""
     gc.callbacks.remove(collecting)
     os.kill(os.getpid(), signal.SIGINT)
+
+
+def test_an_interrupted_start_leaves_no_process():
+    """An emulated bench, or a live view, ran on until the program ended."""
+    process = spawn("hw.bench.run", "{}", stdin=True)
+    threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGINT)).start()
+    with pytest.raises(KeyboardInterrupt):
+        first_line(process, 60.0)
+    assert process.returncode == -signal.SIGKILL
+    # The poses of a controller that answers nothing.
+    with socket.create_server(("127.250.250.2", PORT)):
+        poses = PoseStream("127.250.250.2")
+        threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGINT)).start()
+        with pytest.raises(KeyboardInterrupt):
+            poses.start()
+    assert poses._process is not None
+    assert poses._process.returncode == -signal.SIGKILL
 
 
 @pytest.mark.parametrize("where", ["finaliser", "collector"])
