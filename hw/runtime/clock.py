@@ -132,6 +132,11 @@ class Lag:
         self._floor = t_host - t_device
         self._lowest = self._floor - _MOST_AHEAD_S if math.isfinite(t_host) else -math.inf
         self._last = t_host
+        self._lag = 0.0
+
+    def set_back(self, t_host: float, t_device: float) -> None:
+        """The device's clock was set back: this is taken to be as late as what came before it."""
+        self._floor = t_host - t_device - self._lag
 
     def of(self, t_host: float, t_device: float) -> float:
         """Take the times of a pose or an image; returns its lag."""
@@ -144,4 +149,5 @@ class Lag:
         self._floor = min(self._floor, difference)
         if self._floor < self._lowest:
             self._floor = -math.inf
-        return difference - self._floor
+        self._lag = difference - self._floor
+        return self._lag

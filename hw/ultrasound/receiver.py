@@ -315,8 +315,7 @@ class UltrasoundStream:
         if message.message_id and 0 < number < message.message_id:
             counts.lost += message.message_id - number - 1
         if message.t_device < stamp:
-            # The machine's clock was set back.
-            lag = Lag()
+            lag.set_back(message.t_host, message.t_device)
         self._remember(message, lag)
         counts.received += 1
         late_s = lag.of(message.t_host, message.t_device)

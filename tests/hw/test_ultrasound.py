@@ -160,6 +160,19 @@ def test_stale_frozen_and_back(server: ImageServer) -> None:
         assert stream.statistics().lost == 0
 
 
+def test_late_images_stay_late_when_the_machines_clock_is_set_back() -> None:
+    """They counted as prompt: an image of before the probe came to rest was measured."""
+    stream = UltrasoundStream("127.0.0.1", 1)
+    picture = Picture(np.zeros((4, 4), np.uint8), (1.0, 1.0))
+    late = []
+    for t_host, t_device in (
+        (1.0, 100.0), (1.8, 100.1), (1.9, 100.2), (2.0, 99.3), (2.1, 99.4), (2.2, 100.2),
+    ):  # fmt: skip
+        stream._take(Message("IMAGE", "Image", t_device, picture, t_host=t_host))
+        late.append(stream._images[-1].late_s)
+    np.testing.assert_allclose(late, [0.0, 0.7, 0.7, 0.7, 0.7, 0.0], atol=1e-3)
+
+
 def test_dropped_connection(server: ImageServer) -> None:
     with connected(server) as stream:
         images_of(stream, 3)
