@@ -75,14 +75,14 @@ def lines_of(path: str, outcome: Outcome, speed: float) -> list[str]:
 def share_inside(path: str) -> tuple[int, int, float] | None:
     """Images whose true offset lies in its bracket, those where it is known, their SD (mm).
 
-    None for recordings of a real bench.
+    None for recordings of a real bench, and for a single image, which has no SD.
     """
     with h5py.File(path) as file:
         low, high, true = (
             np.asarray(file[f"placement/{name}"]) for name in ("low", "high", "true_elevation")
         )
     known = np.isfinite(true)
-    if not known.any():
+    if known.sum() < 2:
         return None
     inside = (low <= true) & (true <= high)
     return int(inside.sum()), int(known.sum()), float(true[known].std(ddof=1))
