@@ -56,7 +56,7 @@ def crosswire(folder: Path) -> tuple[list[list[object]], list[str], np.ndarray]:
     data = jaxcal.Problem.from_recording(recording)
     equal = jaxcal.calibrate(data, "conventional", estimate=("scale",), robust=False)
     joint = jaxcal.calibrate(data, estimate=("scale",), robust=False)
-    robust = jaxcal.calibrate(data, estimate=("scale",))
+    robust = jaxcal.calibrate(data, estimate=("scale",), robust=True)
     held_equal = jaxcal.cross_validate(
         data, result=equal, method="conventional", estimate=("scale",)
     )
