@@ -18,7 +18,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from common import arguments, machine, write_table
@@ -166,13 +165,12 @@ SLIPS: dict[str, tuple[Callable[[Arrays], Arrays], tuple[str, ...]]] = {
 FORMS = ("mm", "px, known", "px, unknown")
 
 
-def outcome(arrays: Arrays, method: str) -> tuple[str, str, np.ndarray | None]:
+def outcome(arrays: Arrays) -> tuple[str, str, np.ndarray | None]:
     """How it ends, what is said, and where the points go."""
     estimate = ("scale",) if arrays.form == "px, unknown" else ()
     try:
         recording = jaxcal.Recording(arrays.images())
-        arguments: dict[str, Any] = {"method": method, "estimate": estimate}
-        result = jaxcal.calibrate(recording, **arguments)
+        result = jaxcal.calibrate(recording, estimate=estimate)
     except jaxcal.InputError as error:
         return "refused", str(error), None
     record = calibration_record(result, recording)
@@ -195,9 +193,9 @@ def main() -> None:
     rows: list[list[object]] = []
     for form in FORMS:
         right = [recorded(number, form) for number in range(count)]
-        places = [outcome(arrays, "joint")[2] for arrays in right]
+        places = [outcome(arrays)[2] for arrays in right]
         for slip, (make, words) in SLIPS.items():
-            ends = [outcome(make(arrays), "joint") for arrays in right]
+            ends = [outcome(make(arrays)) for arrays in right]
             how = [end[0] for end in ends]
             apart = [
                 float(np.sqrt(np.mean(np.sum((a - b) ** 2, axis=1))))
