@@ -1,8 +1,9 @@
 """Images of the real cross-wire recording, chosen by the criterion: do they predict the others?
 
-Of its 54 images 27 are chosen from their poses alone, as candidates of a plan; they predict the
-other 27. The same for 200 random halves (``--quick``: 40). The recording is not part of this
-repository: the folder ``shared/data/crosswire`` beside it. Seed 20261129.
+Of its 54 images 27 are chosen as candidates of a plan, from their poses and from X, target and SDs
+of a calibration of all 54; they predict the other 27. The same for 200 random halves (``--quick``:
+40). The recording is not part of this repository: the folder ``shared/data/crosswire`` beside it.
+Seed 20261129.
 """
 
 from __future__ import annotations

@@ -8,8 +8,9 @@ bends: Kaufman's simplification, where ours here is Golub and Pereyra's full der
 
 (a) From one conventional start: objective against iterations and against time, rate of convergence.
 (b) Where each stops as its tolerance goes from 1e-1 to 1e-10. The tolerance of the alternation is X
-    moving by less than t mm and t / 100 rad (t = 0.1: the paper's), that of the others the scaled
-    gradient; variable projection scales it by its own, shorter columns.
+    moving by less than t mm and t / 100 rad (t = 0.1: jaxcal's default, called the paper's in the
+    table), that of the others the scaled gradient; variable projection scales it by its own,
+    shorter columns.
 (c) Where each stops from ten starts around the conventional one: X turned by up to 2 degrees about
     a random axis and shifted by up to 5 mm.
 

@@ -223,7 +223,7 @@ def element_sd_mm(tank: Tank) -> float:
 
 
 def echo_width_mm(tank: Tank) -> float:
-    """Lateral SD of the active echo's mark (hw/bench/phantoms.pyactive_echo.py)."""
+    """Lateral SD of the active echo's mark (hw/bench/phantoms.py)."""
     return float(np.hypot(np.sqrt(2.0) * tank.look.lateral_mm, tank.element_mm / np.sqrt(12.0)))
 
 
