@@ -176,7 +176,10 @@ class ReducedObjective:
     def origin_and_target(
         self, x: Float[np.ndarray, " 6"]
     ) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
-        """The t and c that minimise Eq. 7 for x (those of least norm where several do), mm."""
+        """The t and c that minimise Eq. 7 for x, mm.
+
+        Where several do, these put the mean of the points nearest to the probe's origin.
+        """
         of_mean = self.origin_map @ np.append(x, 1.0)
         target = self.target_map @ np.concatenate([of_mean, x, [1.0]])
         return of_mean - self.mean[0] * x[:3] - self.mean[1] * x[3:], target
