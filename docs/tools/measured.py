@@ -44,7 +44,7 @@ SETTINGS: dict[str, tuple[str, ...]] = {
         "Python 3.11 to 3.14",
         "BSD 3-clause",
     ),
-    INDEX: ("from 22 to 29 November 2026", "a machine with 16 cores", "some with only 8 images"),
+    INDEX: ("from 21 to 30 November 2026", "a machine with 16 cores", "some with only 8 images"),
     ACCURACY: (
         "+- is a 95 % interval",
         "| mean at size 1 mm | SD at size 1 mm |",
