@@ -297,7 +297,7 @@ claim(
 )
 claim(
     ACCURACY,
-    "In the worst cell auto is worse in {:.0f} % of the single trials.",
+    "Auto is worse in up to {:.0f} % of the single trials of a cell.",
     lambda: percent([max(column("auto_grid", "auto_points_loses_to_gaussian"))]),
 )
 claim(
