@@ -102,8 +102,9 @@ SETTINGS: dict[str, tuple[str, ...]] = {
         "for 100 of the recordings",
         "| the same 100 |",
         "With a correlation of 0.6 the intervals",
-        "share (%) of 100 smooth sweeps of each kind in which the truth is outside a 99 % interval",
-        "| truth outside a 99 % interval, and | 12 images | 20 | 30 | 100 in five seconds |",
+        "share (%) of 100 smooth sweeps of each kind in which the truth is outside the 99 % "
+        "interval of at least one of X's six parameters (right intervals: in up to 6 %)",
+        "| truth outside such an interval, and | 12 images | 20 | 30 | 100 in five seconds |",
         "200 recordings each of 12, 30 and 60 images, with uniform offsets up to 1 mm or normal "
         "or heavy-tailed ones with an SD of 1 mm, calibrated with `--prior bounded` and a bound of "
         "0.25 to 4 mm",
