@@ -231,20 +231,17 @@ for words, of, frames in (
 
 
 def _good_and_outside() -> list[float]:
-    """Of good verdicts in smooth sweeps; and of the other sweeps."""
+    """Good verdicts in smooth sweeps (of a hundred trials each); and of the other sweeps, in %."""
     outside = "verdict_good_outside_99"
     if any(_frames(outside, SAME, HOLDS)):
         raise ValueError("the page says that it is so with no held poses")
     wrong, good = sum(_of_smooth(outside, SAME)), sum(_of_smooth("verdict_good", SAME))
-    return [
-        100 * wrong / good,
-        *span(percent(_frames(outside, SAME, SWEEPS))),
-    ]
+    return [good, wrong, *span(percent(_frames(outside, SAME, SWEEPS)))]
 
 
 claim(
     VERDICT,
-    "Of all good verdicts there {:.0f} % have the truth outside. So do not calibrate from one "
+    "Of the {:.0f} good verdicts {:.0f} have the truth outside. So do not calibrate from one "
     "short, smooth sweep. In the longer sweeps of the first row the verdict is good with the truth "
     "outside in {:.0f} to {:.0f} %,",
     _good_and_outside,
