@@ -99,7 +99,7 @@ def _statement(beginning: str, pattern: str) -> list[str]:
 
 claim(
     PAPER,
-    "(with compensation significant at {} of {} noise levels)",
+    "(with compensation it is significant at {} of {} noise levels)",
     lambda: reversed(
         _statement("with compensation RP falls", r"of (\d+) noises above 0, significantly at (\d+)")
     ),
