@@ -68,8 +68,8 @@ claim(
 )
 claim(
     VERDICT,
-    "they are named in {:.1f} to {:.1f} % of the recordings of 30 images, in {:.1f} to {:.1f} % of "
-    "those of 54 and in {:.1f} to {:.1f} % of those of 200.",
+    "at least one of them is named in {:.1f} to {:.1f} % of the recordings of 30 images, in "
+    "{:.1f} to {:.1f} % of those of 54 and in {:.1f} to {:.1f} % of those of 200.",
     lambda: [
         share for images in COUNTS for share in _suspects("fault_named", "three images", images)
     ],
