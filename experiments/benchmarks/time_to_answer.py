@@ -1,7 +1,7 @@
 """How long a person waits for an answer: fresh processes, cold and warm.
 
 Every command runs in processes of its own, in rounds that go through all of them, each beside a
-process that imports JAX and adds two numbers; ratios are to that one of the same round. With a
+process that imports JAX and computes one sum; ratios are to that one of the same round. With a
 cache folder of the round's own:
 
 - *cold*: the first run ever;
