@@ -114,6 +114,7 @@ SETTINGS: dict[str, tuple[str, ...]] = {
         "assumed 3 times too large",
         "re-planning is no better with 12 images, and worse with 30 and 60 images: the first plan",
         "what is added to 8 images is worse",
+        "re-planning chooses from 1500 candidates, planning from 4000",
         "as good as 60 of the Sobol plan",
         "60 planned poses determine it",
         "400 recordings each of 12, 30 and 60 images, and ranges that are too long by 1 mm at 20 "
