@@ -112,8 +112,7 @@ SETTINGS: dict[str, tuple[str, ...]] = {
     PLANNED: (
         "2000 trials a cell (re-planned: 48), offsets of SD 1 mm, 0.5 mm of noise",
         "assumed 3 times too large",
-        "re-planning is no better with 12 images, and worse with 30 and 60 images: the first plan",
-        "what is added to 8 images is worse",
+        "re-planning is no better with 12 images, and worse with 30 and 60 images",
         "re-planning chooses from 1500 candidates, planning from 4000",
         "as good as 60 of the Sobol plan",
         "60 planned poses determine it",
