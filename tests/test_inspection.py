@@ -187,6 +187,10 @@ def test_given_sds_in_metres_are_told_even_of_few_images():
     for unit, told in ((1.0, False), (1e-3, True)):
         given = replace(result, sigma=unit * result.sigma)
         assert ("are the SDs in mm?" in " ".join(given.warnings)) == told
+        # The tracker's SD explains errors as well.
+        lines = replace(result.linearisation, tracker_sd=jnp.asarray(0.5))
+        tracked = replace(given, linearisation=lines)
+        assert "are the SDs in mm?" not in " ".join(tracked.warnings)
 
 
 def test_complaints_are_warnings_in_words():

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from jaxcal.diagnostics.directions import observability
-from jaxcal.diagnostics.image_errors import KINDS
+from jaxcal.diagnostics.image_errors import KINDS, error_sd
 from jaxcal.diagnostics.misfits import misfits
 from jaxcal.diagnostics.outliers import listed_outliers, outliers, suspects_in_words
 from jaxcal.diagnostics.tracker_distortion import too_short
@@ -198,8 +198,8 @@ def _sds_not_tuned(result: Calibration) -> list[str]:
 
 
 def _other_than_given(result: Calibration) -> list[str]:
-    """Given SDs that the residuals contradict."""
-    given, used = np.asarray(result.sigma, float), np.asarray(result.mask) > 0
+    """Given SDs that the residuals contradict, the tracker's included."""
+    given, used = np.asarray(error_sd(result), float), np.asarray(result.mask) > 0
     if result.prior not in TUNED or result.sigma_tuned or result.data != "points":
         return []
     few = used.sum() < MINIMUM_SELF_TUNING
