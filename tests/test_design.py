@@ -341,6 +341,11 @@ def test_poses_that_are_alike_are_counted_once_for_each_image_in_use():
     np.testing.assert_array_equal(search.counts([3, 7]), alike.sum(axis=1))
     alone = search.alike(3)
     np.testing.assert_array_equal(search.counts([3]) - search.counts([]), alone)
+    # Nor does a plan that goes on with another one count them.
+    first = design.plan(pool, 5, prior=Known(MODEL.beliefs(), 400), polish=False)
+    after = design.next_poses(first, pool, 2)
+    expected = np.concatenate([taken[used], first.poses])
+    np.testing.assert_array_equal(after.candidates.taken_and_used, expected)
 
 
 @pytest.mark.parametrize("model", [MODEL, Model()])

@@ -254,8 +254,9 @@ def with_effective_noise(prior: object, candidates: Candidates) -> Candidates:
 
 
 def _with_taken(candidates: Candidates, before: Plan) -> Candidates:
-    parts = [poses for poses in (before.candidates.taken, before.poses) if poses is not None]
-    return replace(candidates, taken=np.concatenate(parts), used=None)
+    """Candidates after the images in use before a plan, and after its poses."""
+    taken = np.concatenate([before.candidates.taken_and_used, before.poses])
+    return replace(candidates, taken=taken, used=None)
 
 
 def make_search(candidates: Candidates, known: Known, criterion: Criterion, rules: Rules) -> Search:
