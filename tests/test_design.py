@@ -238,6 +238,7 @@ for call, said in (
     (lambda: design.simulate_errors(plan, trials="9"), "trials must be a whole number"),
     (lambda: design.simulate_errors(plan, "flat"), "law must be one of uniform"),
     (lambda: design.images_to(plan, "0.2"), "the wanted error must be a positive number"),
+    (lambda: design.images_to(plan, 1e-3, [plan]), "candidates must be made by make_candidates"),
     (lambda: design.make_candidates("linear"), "probe must be a jaxcal.LinearProbe"),
     (lambda: design.make_candidates(region="x"), "region must be made by jaxcal.design.Region"),
     (lambda: design.make_candidates(model="x"), "model must be made by jaxcal.design.Model"),
@@ -319,6 +320,9 @@ def test_what_cannot_be_asked():
         (lambda: design.plan(candidates, 8, prior=Known(np.eye(9) * np.nan)), "finite 9 x 9"),
         (lambda: replace(candidates, taken=np.full((1, 4, 4), np.nan), _checked=False),
          "taken pose 0"),
+        (lambda: replace(candidates, taken=candidates.poses, used=np.array([True]), _checked=False),
+         "used must hold"),
+        (lambda: replace(candidates, used=np.array([True]), _checked=False), "used must hold"),
         (lambda: design.plan(candidates, 8, polish=False).first(-1), "between 0 and 8"),
     ):  # fmt: skip
         with pytest.raises(InputError, match=match):

@@ -22,7 +22,7 @@ from jaxcal.result.calibration import Calibration
 from jaxcal.result.transform import ImageTransform
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.arrays import outline
-from jaxcal.runtime.given_values import LARGEST_SEED, check_made, whole_number
+from jaxcal.runtime.given_values import LARGEST_SEED, check_made, truth_array, whole_number
 
 COUNT = 5000
 """Number of candidates of a plan; twice as many change the predicted error by less than 1 %."""
@@ -79,6 +79,10 @@ class Candidates:
         check_made("constraints", self.constraints, Constraints, "jaxcal.design.Constraints")
         if self.taken is not None:
             object.__setattr__(self, "taken", check_poses(self.taken, what="taken pose"))
+        if self.used is not None:
+            count = 0 if self.taken is None else len(self.taken)
+            if truth_array(self.used, "used").shape != (count,):
+                raise InputError(f"used must hold a truth value for each of {count} taken poses")
         seen = self.model.targets(poses)
         region = self.constraints.region
         nearest = region.place(np.clip(region.unit(seen), -1, 1))

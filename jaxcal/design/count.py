@@ -13,7 +13,7 @@ from jaxcal.design.names import Criterion
 from jaxcal.design.planning import Plan, next_poses, plan
 from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
 from jaxcal.result.calibration import Calibration
-from jaxcal.runtime.given_values import is_number
+from jaxcal.runtime.given_values import check_made, is_number
 
 MOST_IMAGES = 1000
 _ENOUGH = 1000
@@ -52,6 +52,7 @@ def images_to(
             "how many images a calibration lacks depends on the poses to choose from: give "
             "candidates_around(recording, result)"
         )
+    check_made("candidates", candidates, Candidates, "make_candidates or candidates_around")
     assert candidates is not None
     candidates = replace(candidates, poses=candidates.poses[:: -(-len(candidates) // _ENOUGH)])
     # A plan is continued by its own criterion, which may need more images.
