@@ -316,6 +316,13 @@ def test_a_prior_that_pulls_the_sound_speed_is_told_of():
         for k in range(len(recordings))
     ]
     assert told == [False] * 16 + [True] * 8
+    # Each problem of a batch has its own prior, which is relative to its own sound speed.
+    narrower = answers.linearisation.prior_sd / np.arange(1, 25)[:, None]
+    lines = replace(answers.linearisation, prior_sd=narrower)
+    others = replace(answers, linearisation=lines)
+    alone, beside = others[-1].inspection.kurtosis, others.inspection.kurtosis[-1]
+    np.testing.assert_allclose(beside, alone, rtol=1e-12)
+    assert others[:0].elevation_sd.shape == (0, 12)
 
 
 def test_residuals_larger_than_a_beam_is_thick_lower_the_verdict(answers):

@@ -140,7 +140,8 @@ def widened(result: Calibration) -> Calibration:
         return result
     answer = batch_of_one(result)
     whitened = whitened_errors(answer)
-    before, after = _covariances(whitened, further_prior(answer)[0], slow, movement_period(poses))
+    (precision,), _ = further_prior(answer)
+    before, after = _covariances(whitened, precision, slow, movement_period(poses))
     linearisation = result.linearisation
     # The information about all unknowns changes in the same proportion.
     variance = float(linearisation.variance)

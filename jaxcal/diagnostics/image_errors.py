@@ -313,13 +313,13 @@ class Whitened:
         return cls(errors, rows, offset, weight, response, log_sd)
 
     def information(
-        self, kept: Float[Array, "k n"], precision: Float[Array, " p"]
+        self, kept: Float[Array, "k n"], precision: Float[Array, "k p"]
     ) -> Float[Array, "k p p"]:
         """Of images with independent errors, with the precisions of the unknowns' priors."""
         rows = flattened(self.rows * kept[..., None, None])
         weighed = self.offset_response * (kept * self.offset_precision)[..., None]
         taken = np.swapaxes(weighed, 1, 2) @ self.offset_response
-        return np.swapaxes(rows, 1, 2) @ rows - taken + np.diag(precision)
+        return np.swapaxes(rows, 1, 2) @ rows - taken + precision[:, None] * np.eye(rows.shape[-1])
 
     def leverage(self, inverse: Float[Array, "k p p"]) -> Float[Array, "k n 3"]:
         """The share of each error's variance that the fit absorbs."""
@@ -338,22 +338,24 @@ def error_sd(answer: Calibration) -> Float[AnyArray, "*batch 3"]:
     return array_module(answer.sigma).hypot(answer.sigma, tracker[..., None])
 
 
-def further_prior(answer: Calibration) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
+def further_prior(answer: Calibration) -> tuple[Float[Array, "k p"], Float[Array, "k p"]]:
     """Precisions of the priors on further unknowns, and how far the answer is from nominal.
 
-    The answer is one calibration with a leading axis. Both are in the order of its unknowns, in
-    the units of their steps; 0 for those without a prior.
+    The answer has one leading axis. Both are in the order of its unknowns, in the units of their
+    steps; 0 for those without a prior.
     """
-    precision, away = np.zeros((2, count_unknowns(answer.blocks)))
+    precision, away = np.zeros((2, len(answer.mask), count_unknowns(answer.blocks)))
     prior_sd = answer.linearisation.prior_sd
     if prior_sd is None:
         return precision, away
     further = Unknowns.of(answer).further
-    for name, sd in zip(with_prior(answer.blocks), np.asarray(prior_sd)[0], strict=True):
+    for name, sd in zip(with_prior(answer.blocks), np.asarray(prior_sd).T, strict=True):
         nominal = model.TABLE[name].nominal
         at = block_slice(answer.blocks, name)
-        precision[at] = sd**-2.0
-        away[at] = [step_between(name, nominal, value[0], np.log) for value in further[name]]
+        precision[:, at] = sd[:, None] ** -2.0
+        away[:, at] = np.stack(
+            [step_between(name, nominal, value, np.log) for value in further[name]], axis=1
+        )
     return precision, away
 
 

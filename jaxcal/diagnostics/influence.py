@@ -127,7 +127,7 @@ def influence_of(calibration: Calibration) -> Influence:
         found = whitened_errors(alone)
         averaged = calibration.offset_law is not None and bool(calibration.offset_law.weighed)
         at_minimum = not averaged and calibration.method != "alternating"
-        precision, away = further_prior(alone)
+        precision, away = (each[0] for each in further_prior(alone))
         return _influence(found, precision, away, at_minimum=at_minimum)
 
 
