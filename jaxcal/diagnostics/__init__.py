@@ -16,7 +16,7 @@
     channel_points   what the elements' times of flight say of their images' points
     gaussian_offsets   the fit with Gaussian offsets, beside offsets with sharp limits
     outlier_agreement   whether the images left out agree on another calibration
-    diagnose         all of these for a calibration or a batch
+    diagnose         uncertainty and residual_checks, for a calibration or a batch
     directions, misfits, outliers, offset_fit   the same in words
     warnings         everything that a person should know before using an answer
     intervals        confidence intervals and target registration error

@@ -1,4 +1,4 @@
-"""All diagnostics of an answer, computed when first read, for one problem or a whole batch."""
+"""What an answer's properties are computed from when first read, of one problem or a batch."""
 
 from __future__ import annotations
 

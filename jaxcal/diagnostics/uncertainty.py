@@ -58,7 +58,6 @@ class Uncertainty:
         at_bound: 1 where an offset rests on its bound.
         spectra: of the information and the design in scaled units.
         prior_direction: unit vector that the measurements alone leave open; zeros if there is none.
-        inverse: of the information.
         scale: factors that turn every unknown's tangent into mm at the target.
     """
 
@@ -66,7 +65,6 @@ class Uncertainty:
     at_bound: Float[Array, "k n"]
     spectra: Spectra
     prior_direction: Float[Array, "k p"]
-    inverse: Float[Array, "k p p"]
     scale: Float[Array, "k p"]
 
 
@@ -87,9 +85,8 @@ def assess(answer: Calibration, seen: ImageErrors, eps: float) -> Uncertainty:
     design = np.asarray(linearisation.design)
     whitened = answer.prior in TUNED
     found = Spectra.of(information / both, design / both, variance, eps, whitened=whitened)
-    inverse = inverses(information, eps)
     size = np.where(np.isnan(found.weakest_sd), np.nan, variance)
-    at_bound, elevation_sd = _offsets(answer, seen, inverse, size)
+    at_bound, elevation_sd = _offsets(answer, seen, inverses(information, eps), size)
     if linearisation.average_elevation_sd is not None:
         assert answer.offset_law is not None
         better = np.asarray(answer.offset_law.weighed)[:, None] & np.isfinite(elevation_sd)
@@ -99,7 +96,6 @@ def assess(answer: Calibration, seen: ImageErrors, eps: float) -> Uncertainty:
         at_bound=at_bound,
         spectra=found,
         prior_direction=_known_from_prior(answer, seen, scale, eps),
-        inverse=inverse,
         scale=scale,
     )
 
