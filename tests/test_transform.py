@@ -854,7 +854,9 @@ def test_apply_tells_that_the_verdict_expects_more_than_the_covariance_says(tmp_
     result = jaxcal.calibrate(replace(recording, calibration=images))
     factor = result.record()["tre"]["factor"]
     assert factor > 1
-    result.save(tmp_path / "c.json")
+    for name in ("c.json", "c.npz"):
+        result.save(tmp_path / name)
+        assert load_calibration(tmp_path / name).tre_factor == pytest.approx(factor)
     assert main(["apply", str(tmp_path / "c.json"), "--pixel", "1", "40"]) == 0
     assert f"its verdict expects errors {factor:.1f} times as large" in capsys.readouterr().err
     assert f"{factor:.1f} times as large" in repr(load_calibration(tmp_path / "c.json"))

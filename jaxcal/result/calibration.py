@@ -13,6 +13,7 @@ import numpy as np
 from jaxcal import CalibrationError, InputError
 from jaxcal.data.probe import Probe
 from jaxcal.data.problem import Problem
+from jaxcal.io.given_files import path_name
 from jaxcal.model.distributions import OffsetLaw
 from jaxcal.model.unknowns import TABLE, Blocks, Values, block_slice, in_image, with_prior
 from jaxcal.result.diagnostics import Diagnostics, Inspection
@@ -492,8 +493,16 @@ class Calibration(OneOrBatch):
             from jaxcal.report.write import write_json
 
             write_json(path, dated(self.record()))
-        else:
-            self.image_transform().save(path, format)
+            return
+        transform = self.image_transform()
+        # Of the other formats .npz alone holds what the verdict expects.
+        if self.problem is not None and path_name(path).lower().endswith(".npz"):
+            transform = replace(transform, tre_factor=self._tre_factor())
+        transform.save(path, format)
+
+    def _tre_factor(self) -> float:
+        """How many times larger than the covariance says the verdict expects errors to be."""
+        return (self.record()["tre"] or {}).get("factor", 1.0)
 
     def report(self, path: str | os.PathLike[str]) -> None:
         """Write one page for a browser, as ``jaxcal calibrate --report`` does.
@@ -512,8 +521,7 @@ class Calibration(OneOrBatch):
         """Map of the error to expect over the image (matplotlib)."""
         from jaxcal.report import plots
 
-        tre = self.record()["tre"]
-        return plots.plot_tre(self, 1.0 if tre is None else tre.get("factor", 1.0))
+        return plots.plot_tre(self, self._tre_factor())
 
     def plot_residuals(self) -> Figure:
         """Residual of every image (matplotlib)."""
