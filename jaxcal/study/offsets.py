@@ -123,4 +123,4 @@ def standard_deviation(law: LawName) -> float:
         "triangular": 1 / 6,
         "two-humped": 1 + _HUMP**2,
     }
-    return float(jnp.sqrt(squares.get(law, 1.0)))
+    return float(np.sqrt(squares.get(law, 1.0)))
