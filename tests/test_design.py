@@ -350,6 +350,9 @@ def test_poses_that_are_alike_are_counted_once_for_each_image_in_use():
     after = design.next_poses(first, pool, 2)
     expected = np.concatenate([taken[used], first.poses])
     np.testing.assert_array_equal(after.candidates.taken_and_used, expected)
+    # Its poses determine what a single candidate alone would not.
+    single = replace(pool, poses=pool.poses[:1], taken=None, used=None)
+    assert len(design.next_poses(first, single)) == 1
 
 
 @pytest.mark.parametrize("model", [MODEL, Model()])

@@ -134,11 +134,11 @@ def plan(
         cost_s = real_array(cost_s, "cost_s")
         if cost_s.shape != (len(candidates),) or not ((cost_s > 0) & np.isfinite(cost_s)).all():
             raise InputError("cost_s must have a positive number of seconds for each candidate")
+    if isinstance(prior, Plan):
+        candidates = _with_taken(candidates, prior)
     check_candidates(candidates)
     rules = Rules() if rules is None else rules
     check_made("rules", rules, Rules, "jaxcal.design.Rules")
-    if isinstance(prior, Plan):
-        candidates = _with_taken(candidates, prior)
     candidates = with_effective_noise(prior, candidates)
     search = make_search(candidates, known, criterion, rules)
     cover = None
