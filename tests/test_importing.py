@@ -222,6 +222,12 @@ def test_headers_that_are_refused(names, message):
         columns_of_header(names, None)
 
 
+@pytest.mark.parametrize("prefix", ["r", "rot_"])
+def test_four_numbers_of_a_rotation_are_a_quaternion(prefix):
+    names = [*NAMES[:5], *(prefix + axis for axis in "wxyz")]
+    assert columns_of_header(names, None).quaternion == (6, 7, 8, 5)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -229,6 +235,7 @@ def test_headers_that_are_refused(names, message):
          ":4: column 2 ('v') is nan: leave such rows out with --skip-invalid"),
         (lambda row: row[row.index(",") :], ":4: column 1 ('u') is empty: leave such rows out"),
         (lambda row: row + ",1", ":4: 10 columns, the header has 9"),
+        (lambda row: row.replace(".", ","), "by commas; decimal commas need semicolons between"),
         (lambda row: row.rsplit(",", 1)[0] + ",0.5e9", ": quaternion in line 4 has length"),
         (lambda row: row.replace(",", ",x", 1), ":4: column 2 ('v') is not a number"),
     ],

@@ -31,10 +31,10 @@ _NAMES = {
     "x": ("x", "tx", "px", "posx", "positionx", "translationx"),
     "y": ("y", "ty", "py", "posy", "positiony", "translationy"),
     "z": ("z", "tz", "pz", "posz", "positionz", "translationz"),
-    "qx": ("qx", "quatx", "quaternionx", "rotationx", "orientationx"),
-    "qy": ("qy", "quaty", "quaterniony", "rotationy", "orientationy"),
-    "qz": ("qz", "quatz", "quaternionz", "rotationz", "orientationz"),
-    "qw": ("qw", "qs", "quatw", "quaternionw", "rotationw", "orientationw", "w"),
+    "qx": ("qx", "rx", "rotx", "quatx", "quaternionx", "rotationx", "orientationx"),
+    "qy": ("qy", "ry", "roty", "quaty", "quaterniony", "rotationy", "orientationy"),
+    "qz": ("qz", "rz", "rotz", "quatz", "quaternionz", "rotationz", "orientationz"),
+    "qw": ("qw", "rw", "rotw", "qs", "quatw", "quaternionw", "rotationw", "orientationw", "w"),
 }
 _ROLE = {name: role for role, names in _NAMES.items() for name in names}
 _UNIT = re.compile(
@@ -127,8 +127,9 @@ def columns_of_header(names: list[str], quaternion: QuaternionOrder | None) -> C
     Raises:
         FormatError: a name that is not known, twice, or missing beside others; units that differ.
     """
+    scalar = any(_split(name)[0] in ("rw", "rotw") for name in names)
     for index, name in enumerate(names):
-        if _OTHER_ROTATION.fullmatch(_split(name)[0]):
+        if not scalar and _OTHER_ROTATION.fullmatch(_split(name)[0]):
             raise FormatError(f"the header's column {index + 1}, {quoted(name)}: {CONVERT}")
     bases, units = zip(*(_base_and_unit(name) for name in names), strict=True)
     not_read = _not_read(names)

@@ -168,9 +168,11 @@ def read_table(
             cells = blank = blank or [""] * width
         if len(cells) != width:
             before = "the header has" if names else "the rows before have"
+            decimal = separator == "," and len(cells) > width + 1
+            hint = "; decimal commas need semicolons between the cells" if decimal else ""
             raise FormatError(
                 f"{name}:{line}: {len(cells)} columns, {before} {width} (separated by "
-                f"{_SEPARATED[separator]})"
+                f"{_SEPARATED[separator]}{hint})"
             )
         if len(rows) == MOST_ROWS:
             raise FormatError(f"{name}:{line}: more than {MOST_ROWS} rows")
