@@ -206,6 +206,16 @@ def test_an_import_of_few_frames_says_why_and_how_to_go_on(tmp_path, capsys):
     assert shlex.split(lines[-1]) == ["jaxcal", "pick", str(path)]
 
 
+def test_frames_without_tracking_are_not_said_to_show_no_target(tmp_path, capsys):
+    path = tmp_path / "n.igs.mha"
+    write_sequence(path, {PAIR: POSES[:3]}, np.arange(3.0), images=FRAMES[:3])
+    assert main(["import", str(path), str(tmp_path / "n.h5")]) == 2
+    assert capsys.readouterr().err.endswith(
+        "n.igs.mha: only 3 of 3 frames have an image and tracking that are OK, at least 4 are "
+        "needed\n"
+    )
+
+
 def test_where_nothing_is_credible_the_way_on_is_named(tmp_path, capsys):
     path = tmp_path / "n.igs.mha"
     frames = [speckle(RNG) for _ in range(4)]
@@ -910,7 +920,10 @@ def test_lags_that_cannot_be_estimated(tmp_path, lagging, folder, capsys):
     log = np.arange(0, 7, 0.01)
     write_sequence(still, {PAIR: np.tile(POSES[0], (len(log), 1, 1))}, log)
     for arguments, message in (
-        ([images, points, out, "--poses", still], "--lag auto: the images do not tell the lag"),
+        (
+            [images, points, out, "--poses", still],
+            "--lag auto: the images do not tell the lag: it is",
+        ),
         ([images, points, out], "holds no transforms: name the file with its poses (--poses)"),
         ([points, out], "--lag is for poses that are matched to images by their times"),
         ([str(folder), out], "--lag needs --poses: a folder of images has no poses"),

@@ -483,7 +483,8 @@ def used_values(
     if len(above):
         raise InputError(
             f"pixel {above[0]} has row v = {values[above[0], 1]:g}: rows count from the top of the "
-            "image, where v = 0; are u and v exchanged, or counted from the image's middle?"
+            "image, where v = 0; are u and v exchanged, or counted from the image's middle, or "
+            "does it mark an image without the target (leave that one out)?"
         )
     return values
 
@@ -526,7 +527,8 @@ def _check_below_face(
         "pixel",
         (along * pixels[:, 1] + face_offset_mm <= 0) & used,
         "has a range that is not positive: its row lies at or above the transducer's face "
-        "(face_offset_mm is the range of row 0)",
+        "(face_offset_mm is the range of row 0); if it marks an image without the target, leave "
+        "that one out",
     )
 
 

@@ -303,6 +303,11 @@ def lag_of_points(
             f"the lag is {found.lag_s:.3g} s or beyond, where the search ends: subtract about "
             "that from the images' times, and estimate the rest"
         )
+    elif not np.isfinite(found.sd_s):
+        why = (
+            f"the images do not tell the lag: it is beyond the {LARGEST_LAG_S:g} s that are "
+            "searched (do images and poses use the same clock?), or the probe hardly moved"
+        )
     elif found.sd_s > LARGEST_LAG_SD_S:
         why = (
             f"the images do not tell the lag (SD {found.sd_s:.2g} s, at most {LARGEST_LAG_SD_S:g} "

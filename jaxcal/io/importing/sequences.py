@@ -256,10 +256,14 @@ def _found_points(sequence: TrackedSequence, results: FrameResults, minimum: int
     counts, used = results.counts, results.found
     blank, hidden = counts["image not OK"], counts["not credible"]
     if len(used) < minimum:
-        most = next(iter(results.reasons), "there are no frames")
+        if not hidden:
+            raise InputError(
+                f"{sequence.source}: only {len(used)} of {results.asked} frames have an image and "
+                f"tracking that are OK, at least {minimum} are needed"
+            )
         raise InputError(
             f"{sequence.source}: only {len(used)} of {len(used) + hidden} frames show a credible "
-            f"target, at least {minimum} are needed (most often: {most}); "
+            f"target, at least {minimum} are needed (most often: {next(iter(results.reasons))}); "
             "check --region and --target, or place the points by hand: jaxcal pick"
         )
     notes = []
