@@ -230,6 +230,18 @@ def test_figures_have_units_and_the_datas_numbers(result):
             plot(lost)
 
 
+def test_the_scale_bar_is_below_the_numbers_of_a_shallow_image():
+    images = experiment(3, images=100).calibration
+    depth = images.measurements[:, 1]
+    strip = np.abs(depth - np.median(depth)) < 8
+    data = jaxcal.Problem.from_arrays(images.poses, images.measurements, mask=strip)
+    tre = jaxcal.calibrate(data, "conventional").plot_tre()
+    tre.canvas.draw()
+    axes = tre.axes[0]
+    numbers = min(label.get_window_extent().y0 for label in axes.get_xticklabels())
+    assert axes.lines[-1].get_window_extent().y1 < numbers
+
+
 @pytest.mark.parametrize(
     ("given", "message"),
     [

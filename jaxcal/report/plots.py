@@ -14,6 +14,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.transforms import offset_copy
 
 from jaxcal import InputError
 from jaxcal.data.poses import targets_in_images
@@ -309,8 +310,9 @@ def _legend(panel: Axes, loc: Any = "best", **place: Any) -> None:
 def _scale_bar(axes: Axes, length: float) -> None:
     """A bar of a length (mm) below the lateral axis, at its right end: it hides nothing there."""
     right = axes.get_xlim()[1]
-    below = {"transform": axes.get_xaxis_transform(), "clip_on": False}
-    axes.plot([right - length, right], [-0.11] * 2, "k", lw=1.5, solid_capstyle="butt", **below)
-    axes.text(
-        right - length / 2, -0.12, f"{length:g} mm", ha="center", va="top", fontsize=7, **below
-    )
+    # In points: the numbers of the axis, above it, are as far down below a shallow image.
+    below = offset_copy(axes.get_xaxis_transform(), axes.get_figure(True), 0, -17, "points")
+    place = {"transform": below, "clip_on": False}
+    axes.plot([right - length, right], [0, 0], "k", lw=1.5, solid_capstyle="butt", **place)
+    label = f"{length:g} mm"
+    axes.text(right - length / 2, -0.01, label, ha="center", va="top", fontsize=7, **place)
