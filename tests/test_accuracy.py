@@ -385,6 +385,31 @@ def test_the_part_of_the_image_is_named_where_the_rest_is_hardly_known():
             assert depth[strip].min() - 5 < int(least) < int(most) < depth[strip].max() + 5
 
 
+def test_the_part_of_the_image_is_named_where_it_is_small(recording, result):
+    images = recording.calibration
+    high = images.measurements.max(axis=0)
+    assert result.record()["tre"]["image_share"] > 0.6
+    for enlarged, told in ((1.1, False), (2.0, True)):
+        size = tuple(map(int, enlarged * high))
+        framed = replace(recording, calibration=replace(images, frame_size=size))
+        found = jaxcal.calibrate(framed, "conventional", estimate=("scale",))
+        tre = found.record()["tre"]
+        low, end = tre["points"][1]["image"], tre["points"][4]["image"]
+        assert tre["image_share"] == pytest.approx(np.prod((np.array(end) - low) / size))
+        assert ("elsewhere the error may be larger" in "\n".join(found.verdict())) == told
+
+
+def test_where_points_may_be_wrong_the_robust_solve_is_named():
+    images = experiment(3, images=24, elevation_mm=1.0).calibration
+    spread = np.random.default_rng(1).normal(size=(24, 2)) * [0.0, 3.0]
+    data = jaxcal.Problem.from_arrays(images.poses, images.measurements + spread)
+    for robust in (False, True):
+        found = jaxcal.calibrate(data, "conventional", robust=robust)
+        told = [line for line in found.warnings if "errors within the image" in line]
+        assert len(told) == 1
+        assert ("--robust" in told[0]) == (not robust)
+
+
 def test_residuals_that_keep_to_the_model_do_not_contradict_it():
     rng = np.random.default_rng(4)
     rows = rng.normal(size=(40, 3, 5))

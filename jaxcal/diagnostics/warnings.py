@@ -110,10 +110,11 @@ def _implausible_residuals(result: Calibration) -> list[str]:
     lateral, distance = (float(size) for size in np.asarray(result.sigma)[:2])
     if not max(lateral, distance) > CARELESS_MM:
         return []
+    wrong = "" if result.robust else ", or are some points wrong (--robust leaves them out)"
     return [
         f"errors within the image of {lateral:.1f} mm (lateral) and {distance:.1f} mm (range) are "
         "larger than those of points placed with care: are the poses right (order of angles, "
-        "signs, times), and is it one target?"
+        f"signs, times), and is it one target{wrong}?"
     ]
 
 

@@ -137,6 +137,7 @@ def _tre(
     mapped = tre_at(answer, cells)
     return {
         "region": vars(region),
+        "image_share": _image_share(image, answer.frame_size) if pixels else None,
         "unit": "px" if pixels else "mm",
         "stated_mm": over.rms,
         "stated_interval_mm": [over.lower, over.upper],
@@ -158,6 +159,18 @@ def _tre(
             "stated_upper_mm": mapped.upper,
         },
     }
+
+
+def _image_share(image: Float[np.ndarray, "k 2"], frame_size: tuple[int, int] | None) -> float:
+    """The region's share of the frame; of the least frame that holds it where none is known.
+
+    Args:
+        image: [u, v] of the region's middle and corners, px.
+        frame_size: (columns, rows), px.
+    """
+    low, high = image[:5].min(axis=0), image[:5].max(axis=0)
+    size = high - np.minimum(low, 0.0) if frame_size is None else frame_size
+    return float(np.prod((high - low) / size))
 
 
 def _influence(

@@ -26,6 +26,8 @@ from jaxcal.solvers.plan import TUNED
 
 ENOUGH_IMAGES = 20
 """With fewer images in use, more are advised even if the error to expect is small."""
+_SMALL_SHARE = 1 / 3
+"""If the targets were seen in less than this share of the image, the verdict says in which part."""
 _MOST_MOVED_SHARE = 0.3
 """An image is named if leaving it out moves image points by more than this share of the stated
 error."""
@@ -205,7 +207,8 @@ def where(record: dict[str, Any]) -> list[str]:
         f"{_place(worst)}, {_mm(worst['tre_mm'])}."
     ]
     flat = tre["region"]["radius_mm"] is None
-    if flat and (record["observability"]["weakest_sd_mm"] or 0.0) > WEAK_MM:
+    weak = (record["observability"]["weakest_sd_mm"] or 0.0) > WEAK_MM
+    if flat and (weak or (tre["image_share"] or 1.0) < _SMALL_SHARE):
         left, right, near, far = map(round, tre["region"]["lateral_mm"] + tre["region"]["depth_mm"])
         lines.append(
             f"This is for the part in which targets were seen (lateral {left} to {right}, "
