@@ -235,11 +235,12 @@ def pyceres_solver(batch: Batch) -> Solved:
     return _one_by_one(batch, one)
 
 
-def optimistix_solver(batch: Batch) -> Callable[[Batch], Solved]:
+def optimistix_solver(batch: Batch, tolerance: float) -> Callable[[Batch], Solved]:
     """Levenberg-Marquardt of optimistix, vmapped and compiled.
 
     Args:
         batch: of the size that will be solved (it is compiled here).
+        tolerance: relative; a hundredth of it is the absolute one.
     """
     import jax
     import jax.numpy as jnp
@@ -259,7 +260,7 @@ def optimistix_solver(batch: Batch) -> Callable[[Batch], Solved]:
         far = jnp.hypot(q[:, 1], q[:, 2])
         return jnp.stack([q[:, 0] - lateral, far - distance, q[:, 1]], axis=1) / sigma
 
-    solver = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-10)
+    solver = optx.LevenbergMarquardt(rtol=tolerance, atol=1e-2 * tolerance)
 
     @jax.jit
     @jax.vmap

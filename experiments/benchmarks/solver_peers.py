@@ -220,7 +220,16 @@ def contestants(quick: bool) -> dict[str, Contestant]:
             32,
         ),
         ("scipy trf", peers.scipy_solver("trf"), 32),
-        ("optimistix LM, vmapped", peers.optimistix_solver(batch.first(512 // few)), 512),
+        (
+            "optimistix LM, vmapped, 1e-8",
+            peers.optimistix_solver(batch.first(512 // few), 1e-8),
+            512,
+        ),
+        (
+            "optimistix LM, vmapped, 1e-3",
+            peers.optimistix_solver(batch.first(512 // few), 1e-3),
+            512,
+        ),
     ):
         found[name] = Contestant(solve, None, FAR, count // few)
     if peers.missing("pyceres"):
