@@ -294,7 +294,7 @@ claim(
 claim(
     VERDICT,
     "With the images that `calibrate` keeps the intervals contain the truth in {:.1f} to {:.1f} %, "
-    "with all images in {:.1f} to {:.1f} %,",
+    "with all images in {:.1f} to {:.1f} %.",
     lambda: percent(
         [
             *span(column("stream_images", "cover_95_mean", kept=KEPT)),
