@@ -246,6 +246,11 @@ def test_rows_that_are_refused(tmp_path, change, message):
         imported(tmp_path, [*rows[:3], change(rows[3])])
 
 
+def test_a_title_above_the_header_is_named(tmp_path):
+    with pytest.raises(InputError, match=r":2: .* must be the first line, without a title"):
+        imported(tmp_path, ["Recording of Monday", *table(NAMES, COLUMNS)])
+
+
 def test_times_that_go_back(tmp_path):
     lines = table(["time", *NAMES], [[0.0, 1, 2, 2, 3, 1], *COLUMNS])
     with pytest.raises(InputError, match=r"t\.csv:5: the time stamp is not later than the one be"):

@@ -168,8 +168,11 @@ def read_table(
             cells = blank = blank or [""] * width
         if len(cells) != width:
             before = "the header has" if names else "the rows before have"
-            decimal = separator == "," and len(cells) > width + 1
-            hint = "; decimal commas need semicolons between the cells" if decimal else ""
+            hint = ""
+            if names and not rows and _is_header(cells, separator):
+                hint = "; the header must be the first line, without a title above it"
+            elif separator == "," and len(cells) > width + 1:
+                hint = "; decimal commas need semicolons between the cells"
             raise FormatError(
                 f"{name}:{line}: {len(cells)} columns, {before} {width} (separated by "
                 f"{_SEPARATED[separator]}{hint})"
