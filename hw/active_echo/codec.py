@@ -59,6 +59,7 @@ import numpy as np
 
 from hw.runtime.extras import require
 from jaxcal.runtime.array_types import UInt16
+from jaxcal.runtime.messages import printable
 
 NO_RESPONSE = 0xFFFF
 """Time of flight (ticks) of a line without a response."""
@@ -298,8 +299,7 @@ class Decoder:
 
     def _accept_reply(self, text: str) -> Reply:
         self._good()
-        # A person reads it at a terminal, which obeys control characters.
-        text = "".join(letter if letter.isprintable() else "?" for letter in text)
+        text = printable(text)
         word, _, value = text.partition(" ")
         if word == "STRM":
             self.mode = {"ON": Mode.BINARY, "OFF": Mode.TEXT}.get(value, self.mode)

@@ -32,6 +32,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from jaxcal.io.openigtlink import MAXIMUM_BODY
+
 FORMAT, VERSION = "jaxcal-recording", 1
 TEXT_BYTES = 480
 """Events are text of a fixed size: HDF5's heaps of variable text are what a crash damages most."""
@@ -144,8 +146,8 @@ STATIC = ("plan", "test", "truth")
 """Groups of arrays that are written once."""
 
 FRAME_TYPES = ("uint8", "int16")
-LARGEST_ROW = 2**25
-"""Bytes; no image of a stream is larger."""
+LARGEST_ROW = MAXIMUM_BODY
+"""Bytes: as much as a message with an image may have."""
 
 
 @dataclass(frozen=True)

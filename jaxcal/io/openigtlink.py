@@ -36,6 +36,7 @@ from jaxcal.io.message_content import (
 )
 from jaxcal.io.tracked_frame import decode_tracked_frame, encode_tracked_frame
 from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.messages import printable
 
 PORT = 18944
 """OpenIGTLink's registered port, and PlusServer's first."""
@@ -281,8 +282,7 @@ def _status(content: memoryview) -> StatusMessage:
 
 
 def _text(data: bytes) -> str:
-    text = data.partition(b"\0")[0].decode("utf-8", "replace")
-    return "".join(letter if letter.isprintable() else "?" for letter in text)
+    return printable(data.partition(b"\0")[0].decode("utf-8", "replace"))
 
 
 def encode(message: Message) -> bytes:

@@ -12,6 +12,11 @@ def quoted(text: str, limit: int = 40) -> str:
     return ascii(text if len(text) <= limit else f"{text[:limit]}...")
 
 
+def printable(text: str) -> str:
+    """Text of a device with ``?`` for control characters, which a terminal would obey."""
+    return "".join(letter if letter.isprintable() else "?" for letter in text)
+
+
 def shown(value: object) -> str:
     """What a caller gave, short, for a message."""
     return quoted(value) if isinstance(value, str) else quoted(repr(value))[1:-1]
