@@ -8,9 +8,8 @@ bends: Kaufman's simplification, where ours here is Golub and Pereyra's full der
 
 (a) From one conventional start: objective against iterations and against time, rate of convergence.
 (b) Where each stops as its tolerance goes from 1e-1 to 1e-10. The tolerance of the alternation is X
-    moving by less than t mm and t / 100 rad (t = 0.1: jaxcal's default, called the paper's in the
-    table), that of the others the scaled gradient; variable projection scales it by its own,
-    shorter columns.
+    moving by less than t mm and t / 100 rad (t = 0.1: jaxcal's default), that of the others the
+    scaled gradient; variable projection scales it by its own, shorter columns.
 (c) Where each stops from ten starts around the conventional one: X turned by up to 2 degrees about
     a random axis and shifted by up to 5 mm.
 
@@ -112,7 +111,7 @@ def from_starts(bench: Bench, count: int) -> dict[tuple[str, str], list[Stops]]:
         out.setdefault((THREE_STARTS, f"{tightest:g}"), []).append(stop)
         walk = Walk(bench, starts).to(0.1, 1000)
         stop = walk.judged(0.1)
-        out.setdefault((ALTERNATION, "the paper's"), []).append(stop)
+        out.setdefault((ALTERNATION, "0.1 mm"), []).append(stop)
         walk.to(tightest, ROUNDS_FROM_STARTS)
         label = f"{tightest:g} mm or {ROUNDS_FROM_STARTS} rounds"
         out.setdefault((ALTERNATION, label), []).append(walk.judged(tightest))
