@@ -13,6 +13,7 @@ import pytest
 from conftest import problem
 
 import jaxcal
+from jaxcal.calibration.engine import _to_search
 from jaxcal.cli.main import main
 from jaxcal.diagnostics.outliers import outlier_reasons, outliers
 from jaxcal.model.unknowns import RIGID
@@ -225,3 +226,14 @@ def test_nan_in_an_image_left_out_hides_no_outlier():
         np.testing.assert_array_equal(np.flatnonzero(found[-1].outlier), [3])
         points = points.copy()
     np.testing.assert_array_equal(found[0].image_to_probe, found[1].image_to_probe)
+
+
+def test_masked_images_of_a_long_recording_are_not_searched():
+    clean = problem(3, images=400)
+    mask = np.zeros(400)
+    mask[::10] = 1.0
+    used, searched = _to_search(replace(clean, mask=mask).points_only())
+    assert used.tolist() == list(range(0, 400, 10))
+    assert searched.images == 64
+    assert (searched.measurements[:40] == np.asarray(clean.measurements)[::10]).all()
+    assert np.asarray(searched.mask).tolist() == [1.0] * 40 + [0.0] * 24

@@ -22,7 +22,8 @@ from jaxcal.data.problem import Problem, lengthened
 from jaxcal.model.unknowns import MEDIUM
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime import compiler, executables
-from jaxcal.runtime.arrays import first_images, map_arrays
+from jaxcal.runtime.array_types import Int
+from jaxcal.runtime.arrays import each_image, first_images, map_arrays
 from jaxcal.runtime.executables import bucket, padded_images
 from jaxcal.runtime.jax_modes import in_own_modes, inside_transformation
 from jaxcal.solvers.closed_form.single import closed_form_start
@@ -79,16 +80,30 @@ def _solve_kept(problem: Problem, given: Given, plan: SolvePlan) -> Calibration:
     label = _label(plan, padded.images)
     agreed, used = None, problem
     if plan.robust:
-        search = label | {"method": "robust", "prior": "none"}
-        points = padded.points_only()
-        agreed = run(
+        agreed = np.zeros(padded.images, padded.mask.dtype)
+        seen, points = _to_search(problem.points_only())
+        search = label | {"method": "robust", "prior": "none", "images": points.images}
+        found = run(
             "jaxcal.calibration.pipeline:agreed_images", (points,), plan.blocks, label=search
         )
+        agreed[seen] = found[: len(seen)]
         used = replace(problem, mask=agreed[: problem.images])
     start = None if plan.method == "conventional" else closed_form_start(used, plan.blocks)
     arguments = (padded, given, agreed, start)
     result = run("jaxcal.calibration.pipeline:solve_one", arguments, plan, label=label)
     return as_jax_holds(first_images(result, problem.images), problem)
+
+
+def _to_search(problem: Problem) -> tuple[Int[np.ndarray, " m"], Problem]:
+    """The images in which those that agree are searched, and a problem of them alone, padded.
+
+    The images of a long stream that are masked out would take most of the search's time.
+    """
+    used = np.flatnonzero(problem.mask)
+    if padded_images(len(used)) == padded_images(problem.images):
+        used = np.arange(problem.images)
+    kept = each_image(problem, lambda values, axis: np.asarray(values).take(used, axis))
+    return used, lengthened(kept, padded_images(len(used)))
 
 
 @in_own_modes
