@@ -172,7 +172,7 @@ def test_invalid_rows_are_counted(tmp_path):
         imported(tmp_path, [*lines, *more])
     recording, notes, *_ = imported(tmp_path, [*lines, *more], skip_invalid=True)
     assert len(recording) == 6
-    left_out = "4 invalid rows left out (6, 7, 8, 9, counted from 0)"
+    left_out = "4 invalid rows left out (6 to 9, counted from 0)"
     assert notes == [f"{tmp_path / 't.csv'}: {left_out}"]
     assert recording.calibration.frame is None
     # Images are told by their rows where rows are missing among them.

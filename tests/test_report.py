@@ -189,7 +189,7 @@ def test_a_few_test_images_that_do_not_fit_are_named(result, recording, record):
         points[2 : 2 + count, 0] += 15.0 * (-1.0) ** np.arange(count)
         tested = dataclasses.replace(test, measurements=points)
         wrong[count] = calibration_record(result, dataclasses.replace(recording, test=tested))
-    told = "Test images 2, 3, 4 (counted from 0) do not fit the others"
+    told = "Test images 2 to 4 (counted from 0) do not fit the others"
     assert told in " ".join(verdict(wrong[3]))
     assert wrong[3]["tre"]["rms_mm"] == record["tre"]["rms_mm"]
     assert "do not fit the others" not in " ".join(verdict(wrong[8]))

@@ -21,6 +21,7 @@ import jaxcal
 from jaxcal import FormatError, InputError, Options
 from jaxcal.calibration.calibrate import Request, check_request
 from jaxcal.cli.main import main
+from jaxcal.cli.study import _rate
 from jaxcal.data.poses import rotation_angle
 from jaxcal.diagnostics.metrics import reconstruction_precision
 from jaxcal.study import load_spec, open_results, run_study
@@ -744,6 +745,11 @@ def test_what_a_study_computes_is_what_calibrations_say():
                 np.testing.assert_allclose(
                     found[name], expected[name], rtol=2e-6, atol=1e-7, err_msg=name
                 )
+
+
+def test_the_rate_of_a_slow_study_is_not_zero():
+    rates = [_rate(3, 60.0), _rate(1, 300.0), _rate(5000, 2.0)]
+    assert rates == ["0.05 a second", "0.0033 a second", "2500 a second"]
 
 
 def test_load_spec_names_the_file(tmp_path):

@@ -23,6 +23,7 @@ from jaxcal.report.accuracy import region_of, settle
 from jaxcal.report.record import calibration_record
 from jaxcal.report.verdict import advice, verdict
 from jaxcal.runtime.arrays import first_images
+from jaxcal.runtime.messages import runs_in_words
 
 IMAGES = 40
 
@@ -163,8 +164,8 @@ WORDS = {
     "displaced": "a target that moves by",
     "distortion": "tracked positions",
     "marker": "with the probe's orientation",
-    "targets": f"in images {', '.join(map(str, SECOND))} (counted from 0)",
-    "origins": f"in depth in images {', '.join(map(str, SECOND))} (counted from 0)",
+    "targets": f"in images {runs_in_words(SECOND)} (counted from 0)",
+    "origins": f"in depth in images {runs_in_words(SECOND)} (counted from 0)",
 }
 
 

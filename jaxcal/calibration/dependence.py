@@ -50,7 +50,7 @@ from jaxcal.model.thresholds import MAD
 from jaxcal.model.unknowns import RIGID
 from jaxcal.runtime.array_types import Bool, Float, Int
 from jaxcal.runtime.arrays import like
-from jaxcal.runtime.messages import first_ones
+from jaxcal.runtime.messages import runs_in_words
 from jaxcal.solvers.closed_form.single import solve_problem
 
 SAME_POSE_MM = 1.0
@@ -133,7 +133,7 @@ class IndependentImages:
             told.append(
                 f"left out {len(self.frozen)} images, counted from 0, whose pose is that of "
                 f"another one (within {FROZEN_MM:g} mm) while the target moves in them (was "
-                f"tracking frozen?): {first_ones(self.frozen)}"
+                f"tracking frozen?): {runs_in_words(self.frozen, 10)}"
             )
         if self.stride > 1:
             alike = self.alike * self.frames / self.poses

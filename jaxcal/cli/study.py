@@ -74,10 +74,10 @@ def run(spec: str, out: str, resume: bool, workers: int | None, dask: str | None
         raise
     except CalibrationError as error:
         raise CalibrationError(f"{error}; {kept()}" if store.is_begun() else str(error)) from error
-    rate = summary.trials / max(summary.seconds, 1e-9)
+    rate = _rate(summary.trials, summary.seconds)
     click.echo(
         f"{out}: {counted(summary.chunks, 'chunk', 'is', 'are')} done, {summary.computed} of them "
-        f"now ({counted(summary.trials, 'trial')} in {summary.seconds:.1f} s, {rate:.0f} a second)"
+        f"now ({counted(summary.trials, 'trial')} in {summary.seconds:.1f} s, {rate})"
     )
     return ExitCode.CONVERGED
 
@@ -135,6 +135,12 @@ class _Lines:
         click.echo(f"jaxcal: note: {message}", err=True)
 
 
+def _rate(trials: int, seconds: float) -> str:
+    """Trials a second; slow ones with two digits."""
+    rate = trials / max(seconds, 1e-9)
+    return f"{rate:.0f} a second" if rate > 10 else f"{rate:.2g} a second"
+
+
 class _Bar:
     """Trials done, trials a second and time left, on standard error."""
 
@@ -149,8 +155,8 @@ class _Bar:
 
     def advance(self, trials: int) -> None:
         self._done += trials
-        rate = self._done / max(time.monotonic() - self._begun, 1e-9)
-        self._progress.update(self._task, advance=trials, rate=f"{rate:.0f}/s")
+        seconds = time.monotonic() - self._begun
+        self._progress.update(self._task, advance=trials, rate=_rate(self._done, seconds))
 
     def note(self, message: str) -> None:
         self._progress.console.print(f"jaxcal: note: {message}", soft_wrap=True)

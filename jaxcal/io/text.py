@@ -27,7 +27,7 @@ from jaxcal.io.given_files import naming
 from jaxcal.io.lines import text_lines
 from jaxcal.io.table import ABSENT, Table, first_line, parse_numbers, read_table
 from jaxcal.runtime.array_types import Float, Int
-from jaxcal.runtime.messages import counted, first_ones, quoted
+from jaxcal.runtime.messages import counted, quoted, runs_in_words
 
 _LATEST_S = 1e11
 """Latest time, s after any beginning: three thousand years. Stamps in ms or ns are beyond it."""
@@ -107,7 +107,7 @@ class PoseTable:
             said.append(f"{self.name}: columns that are not read: {columns}")
         if self.skipped:
             rows = counted(len(self.skipped), "invalid row")
-            numbers = first_ones(self.skipped, _MOST_NAMED)
+            numbers = runs_in_words(self.skipped, _MOST_NAMED)
             said.append(f"{self.name}: {rows} left out ({numbers}, counted from 0)")
         return said
 

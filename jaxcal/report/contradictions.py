@@ -15,7 +15,7 @@ from jaxcal.diagnostics.residual_checks import FEWEST_TO_CHECK
 from jaxcal.diagnostics.unmodelled import SIDE_MM
 from jaxcal.diagnostics.warnings import IMPLAUSIBLE_RMS_MM
 from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
-from jaxcal.runtime.messages import first_ones
+from jaxcal.runtime.messages import runs_in_words
 from jaxcal.solvers.plan import TUNED
 
 Found = Iterator[tuple[float, str]]
@@ -335,8 +335,8 @@ def _too(positive: str, negative: str, size: float, unit: str) -> str:
 
 
 def images_named(images: Sequence[int]) -> str:
-    """Their numbers; of many images those of the first ones."""
-    return f"{first_ones(images, MOST_IMAGES)} (counted from 0)"
+    """Their numbers; of many runs of images those of the first ones."""
+    return f"{runs_in_words(images, MOST_IMAGES)} (counted from 0)"
 
 
 def _from_groups(record: dict[str, Any]) -> Found:

@@ -21,7 +21,7 @@ from jaxcal.report.contradictions import (
 from jaxcal.report.paragraphs import listed
 from jaxcal.report.resampled import resampled_sentences
 from jaxcal.result.saved import ASKED_FOR
-from jaxcal.runtime.messages import first_ones
+from jaxcal.runtime.messages import first_ones, runs_in_words
 from jaxcal.solvers.plan import TUNED
 
 ENOUGH_IMAGES = 20
@@ -456,7 +456,7 @@ def _check_outliers(record: dict[str, Any]) -> str | None:
     if not outliers:
         return None
     plural, was, them = ("", "was", "it") if len(outliers) == 1 else ("s", "were", "them")
-    images = f"image{plural} {first_ones(outliers)} (counted from 0)"
+    images = f"image{plural} {runs_in_words(outliers, 10)} (counted from 0)"
     if record.get("robust"):
         return f"Check {images}, which {was} left out, and pick the target in {them} again."
     return (

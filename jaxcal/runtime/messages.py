@@ -22,15 +22,16 @@ def shown(value: object) -> str:
     return quoted(value) if isinstance(value, str) else quoted(repr(value))[1:-1]
 
 
-def runs_in_words(numbers: Sequence[int]) -> str:
-    """Ascending whole numbers, runs of them as their ends: ``3, 7 to 9``."""
+def runs_in_words(numbers: Sequence[int], most: int | None = None) -> str:
+    """Ascending whole numbers, runs of them as their ends: ``3, 7 to 9``; at most so many runs."""
     runs: list[list[int]] = []
     for number in numbers:
         if runs and number == runs[-1][-1] + 1:
             runs[-1].append(number)
         else:
             runs.append([number])
-    return ", ".join(str(run[0]) if len(run) == 1 else f"{run[0]} to {run[-1]}" for run in runs)
+    told = [str(run[0]) if len(run) == 1 else f"{run[0]} to {run[-1]}" for run in runs]
+    return first_ones(told, len(told) if most is None else most)
 
 
 def counted(count: int, noun: str, one: str = "", several: str = "") -> str:

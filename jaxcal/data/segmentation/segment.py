@@ -39,7 +39,7 @@ from jaxcal.runtime.arrays import outline
 from jaxcal.runtime.compiler import ONE_PROBLEM, batch_flags, fast_to_run
 from jaxcal.runtime.given_values import check_flag, is_number, whole_number
 from jaxcal.runtime.jax_modes import in_own_modes
-from jaxcal.runtime.messages import counted, first_ones, shown
+from jaxcal.runtime.messages import counted, runs_in_words, shown
 
 MINIMUM_LINES = 8
 """With fewer answers a frame's noise cannot be estimated and an outlier cannot be seen."""
@@ -487,7 +487,7 @@ def _warnings(
         )
     if failed.any():
         rows = np.flatnonzero(failed)
-        named, count = first_ones(rows.tolist(), 8), int(used.sum())
+        named, count = runs_in_words(rows.tolist(), 8), int(used.sum())
         found.append(f"{len(rows)} of {count} frames could not be segmented: {named}")
     kept = used & ~failed
     total = max(int(kept.sum()) * elements, 1)
