@@ -731,6 +731,17 @@ def test_pixels_of_an_unusual_size_are_named():
         assert len(unusual) == (factor < 1)
 
 
+def test_oblong_pixels_are_named():
+    images = experiment(3, images=24).calibration
+    for factor in (1.0, 4.0):
+        pixels = images.measurements / [0.12, 0.1 / factor] + [260.0, 0.0]
+        found = jaxcal.calibrate(
+            jaxcal.make_images(images.poses, pixels, "pixel"), "conventional", estimate="scale"
+        )
+        oblong = [text for text in found.warnings if "before scan conversion" in text]
+        assert len(oblong) == (factor > 1)
+
+
 @pytest.mark.parametrize("left_out", [0, 10, 20])
 def test_resampling_that_agrees_changes_nothing(record, left_out):
     changed = stating(record, 0.4)

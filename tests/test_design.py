@@ -711,6 +711,7 @@ def test_simulated_errors_count_the_images_taken_before():
     [
         ({"candidates": None}, "candidates"),
         ({"poses": np.tile(np.eye(4), (2, 2, 5, 1, 1))}, "poses must be"),
+        ({"poses": np.full((5, 4, 4), np.nan)}, "pose 0 holds NaN or Inf"),
         ({"trials": 1}, "trials"),
     ],
 )
@@ -719,3 +720,9 @@ def test_simulations_that_cannot_be(change, match):
     given = {"poses": candidates.poses, "law": "normal", "candidates": candidates} | change
     with pytest.raises(InputError, match=match):
         design.simulate_errors(given.pop("poses"), **given)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_a_calibration_is_no_law():
+    with pytest.raises(InputError, match="law must be one of"):
+        design.simulate_errors(np.tile(np.eye(4), (5, 1, 1)), np.eye(4), some(8))

@@ -128,7 +128,7 @@ def test_points_of_a_pair_may_have_a_header(pair, rows, order):
         ("u,v,valid", "other columns"),
         ("u [mm],v [mm]", "its header says that points are in mm, but .*poses.txt has no header"),
         ("lateral,range", "its header says that points are in mm"),
-        ("m11,m12", "'m11', is not known"),
+        ("m11,m12", "columns 1 .'m11'. and 2 .'m12'. are not known"),
         ("x,y", "points in the image are named u and v"),
     ],
 )

@@ -725,6 +725,12 @@ def test_export_to_standard_output(saved, capsys, name):
     assert capsys.readouterr().out == random_transform().text(name)
 
 
+@pytest.mark.usefixtures("unchecked")
+def test_what_an_unknown_format_leaves_out_is_not_asked():
+    with pytest.raises(InputError, match="'xyz' is not a format"):
+        jaxcal.ImageTransform(np.eye(4)).left_out("xyz")
+
+
 def test_the_ending_names_the_format(saved, tmp_path, capsys):
     for ending in ("xml", "tfm", "yaml", "csv", "npy", "npz"):
         out = tmp_path / f"a.{ending}"

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from jaxcal import InputError
+from jaxcal.data.poses import check_poses
 from jaxcal.data.problem import Problem
 from jaxcal.data.recording import MINIMUM_IMAGES
 from jaxcal.design.candidates import Candidates
@@ -88,7 +89,8 @@ def simulate_errors(
         seed: of the offsets and errors.
 
     Raises:
-        InputError: no candidates, fewer than 4 poses, an unknown law, or a wrong number of trials.
+        InputError: no candidates, fewer than 4 poses, one that is not rigid, an unknown law, or a
+            wrong number of trials.
     """
     from jaxcal.calibration.calibrate import calibrate_batch
     from jaxcal.study.laws import check_law
@@ -105,6 +107,7 @@ def simulate_errors(
         raise InputError(f"poses must be (n, 4, 4) or (trials, n, 4, 4), not {poses.shape}")
     if poses.shape[-3] < MINIMUM_IMAGES:
         raise InputError(f"{poses.shape[-3]} poses are too few: at least {MINIMUM_IMAGES}")
+    check_poses(poses.reshape(-1, 4, 4))
     if poses.ndim == 4:
         trials = len(poses)
     whole_number("trials", trials, 2, MOST_TRIALS)

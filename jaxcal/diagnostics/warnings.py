@@ -29,6 +29,8 @@ USUAL_PIXEL_MM = (0.02, 1.0)
 """Estimated pixel sizes outside this interval lead to a warning."""
 _MILLIMETRE = 0.1
 """So do pixels whose sides are 1 mm to within this share: points in mm look like that."""
+MOST_OBLONG = 3.0
+"""And pixels of which one side is so many times as long as the other."""
 UNLIKELY_STATED_SDS, LEAST_MISSTATED = 4.0, 0.005
 """Estimated pixels contradict their stated size if they differ from it by more than so many SDs and
 by more than this share."""
@@ -303,7 +305,12 @@ def _unusual_pixels(result: Calibration) -> list[str]:
         ]
     least, largest = USUAL_PIXEL_MM
     if least <= min(lateral, axial) and max(lateral, axial) <= largest:
-        return []
+        if max(lateral, axial) <= MOST_OBLONG * min(lateral, axial):
+            return []
+        return [
+            f"pixels of {lateral:.3g} x {axial:.3g} mm are unusual for images that are shown: are "
+            "they lines before scan conversion, or was the image stretched where u and v were read?"
+        ]
     return [
         f"pixels of {lateral:.3g} x {axial:.3g} mm are unusual for ultrasound ({least:g} to "
         f"{largest:g} mm): are the poses' translations in mm?"

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from jaxcal import FormatError
 from jaxcal.data.names import QuaternionOrder
-from jaxcal.runtime.messages import quoted
+from jaxcal.runtime.messages import enumerated, quoted
 
 LENGTHS_MM: dict[str, float] = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
 TIMES_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
@@ -111,10 +111,15 @@ class Columns:
     not_read: tuple[str, ...] = ()
 
 
+def _is_numbered(base: str) -> bool:
+    """Whether a name may be that of a cell of a matrix, or of one of several numbers."""
+    return bool(_CELL.fullmatch(base) or _NUMBERED.fullmatch(base))
+
+
 def names_columns(cells: list[str]) -> bool:
     """Whether most of the cells are names of columns, rather than words of a sentence."""
     bases = [_split(cell)[0] for cell in cells]
-    known = [b for b in bases if b in _ROLE or _CELL.fullmatch(b) or _NUMBERED.fullmatch(b)]
+    known = [base for base in bases if base in _ROLE or _is_numbered(base)]
     return 2 * len(known) > len(cells)
 
 
@@ -152,7 +157,7 @@ def columns_of_header(names: list[str], quaternion: QuaternionOrder | None) -> C
             )
         else:
             roles[role] = index
-    strange = [k for k in rest if not (_CELL.fullmatch(bases[k]) or _NUMBERED.fullmatch(bases[k]))]
+    strange = [k for k in rest if not _is_numbered(bases[k])]
     if "slice" in bases:
         raise FormatError(
             f"the header's column {bases.index('slice') + 1}, "
@@ -161,13 +166,16 @@ def columns_of_header(names: list[str], quaternion: QuaternionOrder | None) -> C
             "and v (X and Y in pixels)"
         )
     if strange:
-        raise _unknown(names, strange[0])
+        cells = {*rest} - {*strange} - {column for _, column in numbered}
+        if len(cells) not in (9, 12, 16):  # they are no matrix, either
+            strange = sorted({*strange, *cells})
+        raise _unknown(names, strange)
     quaternion_columns = _quaternion(roles, numbered, quaternion)
     rest = [index for index in rest if index not in (quaternion_columns or ())]
     translation = _complete(roles, ("x", "y", "z"), "x, y and z")
     matrix = _matrix(rest, list(bases), translation)
     if rest and matrix is None:
-        raise _unknown(names, rest[0])
+        raise _unknown(names, rest)
     if matrix is not None and translation is not None and len(rest) != 9:
         raise FormatError("the header names both a whole matrix and x, y, z")
     if (quaternion_columns is None) != (translation is None) and matrix is None:
@@ -222,11 +230,13 @@ def _header_part(name: str) -> str | None:
     return found["part"] or found["child"]
 
 
-def _unknown(names: list[str], column: int) -> FormatError:
+def _unknown(names: list[str], columns: list[int]) -> FormatError:
+    first = f" {columns[0] + 1}, {quoted(names[columns[0]])}, is"
+    listed = enumerated([f"{each + 1} ({quoted(names[each])})" for each in columns])
+    which = first if len(columns) == 1 else f"s {listed} are"
     return FormatError(
-        f"the header's column {column + 1}, {quoted(names[column])}, is not known: name the "
-        "columns time, frame, u, v, x, y, z, qx, qy, qz, qw or m11 to m34 (comment: one that is "
-        "not read), or leave the header out"
+        f"the header's column{which} not known: name the columns time, frame, u, v, x, y, z, qx, "
+        "qy, qz, qw or m11 to m34 (comment: all that are not to be read), or leave the header out"
     )
 
 
@@ -246,9 +256,11 @@ def _base_and_unit(name: str) -> tuple[str, str | None]:
     if base == "%time" and unit is None:
         # As "rostopic echo -p" writes it.
         base, unit = "time", "ns"
-    if unit is not None and unit not in _UNITS:
+    if unit is None or unit in _UNITS:
+        return base, None if unit is None else _UNITS[unit]
+    if _is_numbered(base) or _ROLE.get(base, "ignored") != "ignored":
         raise FormatError(f"the unit of {quoted(name)} is not known")
-    return base, None if unit is None else _UNITS[unit]
+    return base, None
 
 
 def _complete(roles: dict[str, int], names: tuple[str, ...], what: str) -> tuple[int, ...] | None:

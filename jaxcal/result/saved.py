@@ -223,6 +223,7 @@ def renamed(transform: ImageTransform) -> str | None:
 
 def left_out(transform: ImageTransform, format: SaveFormat) -> str | None:
     """What a format cannot hold, in words; None where nothing is. ``numpy`` is the .npy here."""
+    _endings(format)
     note = _range_note(transform) if format == "ros" else None
     lost = []
     if transform.covariance is not None and format != "json":

@@ -425,7 +425,11 @@ class ImageTransform:
         return ("Image", probe_name(self.probe_frame)) if frames is None else frames
 
     def left_out(self, format: SaveFormat) -> str | None:
-        """What a format cannot hold and its user must do, in words; None if it holds everything."""
+        """What a format cannot hold and its user must do, in words; None if it holds everything.
+
+        Raises:
+            InputError: an unknown format.
+        """
         from jaxcal.result import saved
 
         return saved.left_out(self, format)

@@ -29,5 +29,5 @@ OFFSET_LAWS: tuple[LawName, ...] = get_args(LawName)
 
 def check_law(law: object, name: str = "elevation_distribution") -> None:
     """Raise InputError, which names the argument, for something that is no law's name."""
-    if law not in OFFSET_LAWS:
+    if not (isinstance(law, str) and law in OFFSET_LAWS):
         raise InputError(f"{name} must be one of {', '.join(OFFSET_LAWS)}, not {shown(law)}")
