@@ -49,6 +49,10 @@ CALLER_S = 0.12
 """How long the process that asks for motions may be silent in one (bench s): with the time to
 notice it and to slow down the robot rests within 0.2 s."""
 _MOST_CORNERS = 64
+_LEAST_AGE_S = 0.02
+"""A CB controller sends a pose every 8 ms, whose latency is bounded to no less than that."""
+_LEAST_FORCE_N = 2.0
+"""The precision of the finest force sensor of the maker's arms (data sheet of the UR3e)."""
 
 Vector3 = tuple[float, float, float]
 Vector6 = tuple[float, float, float, float, float, float]
@@ -85,9 +89,9 @@ class Limits:
     search_speed_mm_s: float = 10.0
     """Speed cap of motions within the search envelope of one pose; at most 10 mm/s."""
     max_pose_age_s: float = 0.1
-    """Largest age of the newest pose, before and during a motion; at most 0.1 s."""
+    """Largest age of the newest pose, before and during a motion; 0.02 to 0.1 s."""
     max_force_n: float = 20.0
-    """Force at the TCP above which no motion starts, and a running one is stopped."""
+    """Force at the TCP above which no motion starts, and a running one is stopped; 2 to 250 N."""
     force_reason: str = ""
     """Why a cap above 140 N is needed; without a reason such a cap is refused."""
     hull_mm: tuple[Vector3, ...] = ()
@@ -152,8 +156,23 @@ class Limits:
         between("search_mm", self.search_mm, 0.0, 50.0, closed=True)
         between("search_deg", self.search_deg, 0.0, 10.0, closed=True)
         between("search_speed_mm_s", self.search_speed_mm_s, 0.01, 10.0)
-        between("max_pose_age_s", self.max_pose_age_s, 0.0, 0.1)
-        between("max_force_n", self.max_force_n, 0.0, 250.0)
+        # Below the lower bounds every move would be refused, and only at the robot.
+        between(
+            "max_pose_age_s",
+            self.max_pose_age_s,
+            _LEAST_AGE_S,
+            0.1,
+            closed=True,
+            why="the newest pose of a controller may be that old",
+        )
+        between(
+            "max_force_n",
+            self.max_force_n,
+            _LEAST_FORCE_N,
+            250.0,
+            closed=True,
+            why="an arm that touches nothing measures as much",
+        )
         between("max_joint_speed_deg_s", self.max_joint_speed_deg_s, 0.0, 180.0)
         between("min_singular_value_mm", self.min_singular_value_mm, 1.0, 100.0, closed=True)
         if self.max_force_n > FORCE_WITHOUT_REASON_N and len(self.force_reason.strip()) < 10:
@@ -254,9 +273,15 @@ def hull_of(
     return tuple((float(x), float(y), float(z)) for x, y, z, _ in placed)
 
 
-def between(name: str, value: float, low: float, high: float, *, closed: bool = False) -> None:
-    """Refuse a value that is not above ``low`` (``closed``: nor equal to it) or above ``high``."""
+def between(
+    name: str, value: float, low: float, high: float, *, closed: bool = False, why: str = ""
+) -> None:
+    """Refuse a value that is not above ``low`` (``closed``: nor equal to it) or above ``high``.
+
+    ``why`` tells, of a value below ``low``, what is wrong with it.
+    """
     if closed and not low <= value <= high:
-        raise refused(f"{name} must be {low:g} to {high:g}, not {value:g}")
+        reason = f": {why}" if why and value < low else ""
+        raise refused(f"{name} must be {low:g} to {high:g}, not {value:g}{reason}")
     if not closed and not low < value <= high:
         raise refused(f"{name} must be above {low:g} and at most {high:g}, not {value:g}")

@@ -452,7 +452,7 @@ def test_limits_from_a_file():
         ("search_mm = 5.0", "search_mm = -0.5", "search_mm must be 0 to 50, not -0.5"),
         ("search_mm = 5.0", "search_mm = 5.0\nmin_singular_value_mm = 0.5", "must be 1 to 100,"),
         ("search_mm = 5.0", "search_mm = 5.0\nsearch_speed_mm_s = 20.0", "at most 10"),
-        ("search_mm = 5.0", "search_mm = 5.0\nmax_pose_age_s = 0.2", r"at most 0\.1"),
+        ("search_mm = 5.0", "search_mm = 5.0\nmax_pose_age_s = 0.2", r"0\.02 to 0\.1, not 0\.2$"),
         ("[500.0, 0.0, 300.0]", "[500.0, 0.0]", "3 finite numbers"),
         ("[500.0, 0.0, 300.0]", "'a lot'", "3 finite numbers"),
         ("[500.0, 0.0, 300.0]", "[500.0, 0.0, 100.0]", "below box_max_mm"),

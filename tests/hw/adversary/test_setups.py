@@ -81,6 +81,13 @@ def test_the_good_setup_passes(tmp_path, capsys):
         ("search_mm = 25", "search_mm = 100", "search_mm must be"),
         ("search_deg = 0.5", "search_deg = 30", "search_deg must be"),
         ("[plan]", "max_force_n = 250\n[plan]", "needs a sentence why: force_reason"),
+        # Caps by which every move would be refused, but only at the robot.
+        (
+            "[plan]",
+            "max_force_n = 1e-3\n[plan]",
+            "2 to 250, not 0.001: an arm that touches nothing",
+        ),
+        ("[plan]", "max_pose_age_s = 1e-3\n[plan]", "0.02 to 0.1, not 0.001: the newest pose"),
         ("[plan]", "min_singular_value_mm = 0\n[plan]", "min_singular_value_mm must be"),
         ("[plan]", "arm_box_min_mm = [-1e9, -1e9, -1e9]\n[plan]", "arm_box_min_mm and"),
         ("[plan]", "joint_max_deg = [720, 720, 720, 720, 720, 720]\n[plan]", "within 360 deg"),
