@@ -106,6 +106,8 @@ class Controller:
     """Why the program last stopped."""
     payload_kg: float = 0.0
     payload_cog_m: tuple[float, ...] = (0.0, 0.0, 0.0)
+    further_bits: tuple[int, int] = (0, 0)
+    """Set besides those that follow from the state: of robot_status_bits, of safety_status_bits."""
     overspeed: float = 1.0
     """A fault: motions are so many times as fast as commanded."""
     heeds_stops: bool = True
@@ -149,7 +151,7 @@ class Controller:
     @property
     def robot_status_bits(self) -> int:
         """Bit 0 power, bit 1 program running."""
-        return int(self.robot_mode in _POWERED) | (2 if self.running else 0)
+        return int(self.robot_mode in _POWERED) | (2 if self.running else 0) | self.further_bits[0]
 
     @property
     def safety_status_bits(self) -> int:
@@ -157,12 +159,13 @@ class Controller:
 
         Besides: bit 7 in both emergency stops, bit 10 in every stop.
         """
+        further = self.further_bits[1]
         if self.safety_mode in (NORMAL, REDUCED):
-            return 1 << (self.safety_mode - 1)
+            return 1 << (self.safety_mode - 1) | further
         if self.safety_mode > ROBOT_EMERGENCY:
-            return 1 << self.safety_mode | 1 << 10
+            return 1 << self.safety_mode | 1 << 10 | further
         emergency = self.safety_mode in (SYSTEM_EMERGENCY, ROBOT_EMERGENCY)
-        return 1 << (self.safety_mode - 1) | (1 << 7 if emergency else 0) | 1 << 10
+        return 1 << (self.safety_mode - 1) | (1 << 7 if emergency else 0) | 1 << 10 | further
 
     def enter(self, t: float, robot_mode: int, safety_mode: int) -> None:
         """Another state of the robot: what a person does at the pendant, a gate, or a fault does.

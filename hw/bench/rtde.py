@@ -175,6 +175,8 @@ class RtdeServer:
         - ``drop``: reset all clients' connections; ``drop control``: only those that command;
         - ``protective_stop``: as if the arm had met an obstacle; ``unlock``;
         - ``robot_state`` (robot_mode, safety_mode): :meth:`hw.bench.controller.Controller.enter`;
+        - ``bits`` (robot, safety): further robot_status_bits (4: the freedrive button is pressed)
+          and safety_status_bits (2048: the input of an enabling device is active);
         - ``force`` (N and N m): on the tool;
         - ``remote`` (on): remote or local control of an e-Series;
         - ``play``: our program ends, and soon another one runs;
@@ -214,6 +216,8 @@ class RtdeServer:
                 program.safety_mode = NORMAL
             case ["robot_state", robot_mode, safety_mode]:
                 program.enter(t, robot_mode, safety_mode)
+            case ["bits", robot, safety]:
+                program.further_bits = int(robot), int(safety)
             case ["force", force]:
                 self.arm.force = tuple(force)
             case ["remote", on]:

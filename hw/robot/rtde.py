@@ -51,8 +51,13 @@ _OPTIONAL = ("tcp_offset", "payload", "payload_cog", "actual_q")
 RUNNING_MODE = 7
 PROGRAM_RUNS = 0b10
 """Bit of robot_status_bits."""
+FREEDRIVE_PRESSED = 0b100
+"""The same, of the button at the pendant by which a person takes the arm in hand."""
 NORMAL_BITS = 0b11
 """safety_status_bits of a robot that may move: normal, or reduced mode."""
+_INPUT_BITS = 1 << 11
+"""Bits of an input, the enabling device's ("3PE", PolyScope 5.25 or newer): where it stops the arm,
+the bits above normal and reduced tell so, too."""
 _POWER = "switch the robot on and release its brakes at the pendant"
 _SAFETY_STATES = (
     (2, "protective stop", "find its cause, then release it at the pendant"),
@@ -87,7 +92,7 @@ _PLAYS = _PAUSED | {2, 5}
 
 def safety_text(bits: int) -> str:
     """Which safety stop by safety_status_bits, and what a person must do; empty if none is."""
-    wrong = bits & ~NORMAL_BITS
+    wrong = bits & ~(NORMAL_BITS | _INPUT_BITS)
     shown = wrong & ~_SUMMARIES or wrong
     found = [state for state in _SAFETY_STATES if shown >> state[0] & 1]
     if not found:
@@ -98,6 +103,8 @@ def safety_text(bits: int) -> str:
 def state_text(robot_mode: int, safety_bits: int) -> str:
     """Why the robot may not move, and what a person must do; an empty string when it may."""
     problem = safety_text(safety_bits)
+    if not problem and not safety_bits & NORMAL_BITS:
+        problem = "the robot reports no safety state: check the pendant"
     if problem or robot_mode == RUNNING_MODE:
         return problem
     name, cure = _MODES.get(robot_mode, (f"in mode {robot_mode}", "check the pendant"))

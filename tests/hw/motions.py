@@ -79,6 +79,7 @@ def put_in_order(robot: EmulatedRobot) -> EmulatedRobot:
     robot.ask("dashboard", None)
     robot.ask("remote", True)
     robot.ask("robot_state", 7, 1)
+    robot.ask("bits", 0, 0)
     robot.ask("payload", 0.0)
     robot.ask("speed_slider", 1.0)
     robot.ask("tcp_offset", OFFSET)

@@ -25,7 +25,7 @@ from waiting import until
 from hw.bench.arm import Arm
 from hw.bench.rtde import RtdeServer
 from hw.robot.identity import read_identity
-from hw.robot.rtde import Packet, PacketReader, PendantSettings, safety_text
+from hw.robot.rtde import Packet, PacketReader, PendantSettings, safety_text, state_text
 from hw.robot.stream import PoseSample, PoseStream, average
 from hw.runtime.clock import Clock, Lag, monotonic_s
 from hw.runtime.errors import LostError, RefusedError, StaleError
@@ -386,6 +386,10 @@ def test_safety_bits_are_named():
     assert safety_text(0b01) == safety_text(0b11) == ""
     assert safety_text(0b101).startswith("protective stop: find its cause")
     assert "emergency" in safety_text(1 << 6)
+    # The input of an enabling device is no stop, and no sign that the robot may move.
+    assert state_text(7, 0b01 | 1 << 11) == state_text(7, 0b10 | 1 << 11) == ""
+    assert safety_text(0b100 | 1 << 11).startswith("protective stop")
+    assert "no safety state" in state_text(7, 0) == state_text(7, 1 << 11)
     assert "0x80000000" in safety_text(1 << 31)
 
 

@@ -10,7 +10,7 @@ from hw.robot.mover.controller import PAUSED, Controller, unfit
 from hw.robot.mover.inputs import Inputs, Stop, lost
 from hw.robot.mover.messages import Setup
 from hw.robot.path_checks import out_of_box_mm
-from hw.robot.rtde import PROGRAM_RUNS
+from hw.robot.rtde import FREEDRIVE_PRESSED, PROGRAM_RUNS
 from hw.runtime.errors import StaleError, StoppedError
 
 _BOX_MARGIN_MM = 1.0
@@ -52,6 +52,8 @@ class Monitor:
             stopped = unfit(packet)
             if stopped is not None:
                 return Stop(stopped, True)
+        if any(packet.status_bits & FREEDRIVE_PRESSED for packet in packets):
+            return _for_good("the freedrive button was pressed: somebody wants to guide the arm")
         if any(packet.paused for packet in packets):
             return _for_good(PAUSED)
         if self._controller.local:
