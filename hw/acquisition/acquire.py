@@ -390,15 +390,18 @@ class _Run:
             DeviceError: a device is in lasting trouble, or the pose changed at rest.
         """
         setup = self.job.setup
-        pose, image = stage.resting_pose(setup.settle_s), None
+        pose = stage.resting_pose(setup.settle_s)
         if self.job.request.by_image:
             # The frame that is measured is the one that is recorded.
             measurement, amplitude, image = stage.locate(row)
         else:
             heard = session.listen(setup.frames, stage.arrived_s)
             measurement, amplitude = median_times(heard)
+            # The newest one of a slow machine may be from before the probe came to rest.
+            image = stage.any_frame()
         stage.check()
-        session.record_image(image)
+        if image is not None:
+            session.record_image(image)
         return pose, measurement, amplitude
 
     def _select(

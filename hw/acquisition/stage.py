@@ -157,6 +157,12 @@ class ProbeStage:
         self._motion.check()
         return self._session.image_after(self.arrived_s + IMAGE_AGE_S)
 
+    def any_frame(self) -> Image | None:
+        """As :meth:`whole_frame`, but RF will do; None where the setup has no machine."""
+        if self._session.images is None:
+            return None
+        return self._session.image_after(self.arrived_s + IMAGE_AGE_S, rf=True)
+
     def image_bench(self, row: int, *, credible: bool = False) -> ImageBench:
         """The bench of the procedures for a phantom that only shows in the image.
 

@@ -361,8 +361,12 @@ class Session:
         with self._lock:
             return self._image
 
-    def image_after(self, since: float) -> Image:
+    def image_after(self, since: float, *, rf: bool = False) -> Image:
         """The first B-mode frame that arrives after a moment, or would have if it were not late.
+
+        Args:
+            since: bench time.
+            rf: whether RF will do.
 
         Raises:
             DeviceError: trouble while waiting.
@@ -373,7 +377,8 @@ class Session:
         with self._lock:
             while True:
                 image = self._image
-                if image is not None and image.prompt_s > since and image.array.dtype == np.uint8:
+                fits = image is not None and (rf or image.array.dtype == np.uint8)
+                if image is not None and fits and image.prompt_s > since:
                     return image
                 if self._failure is not None:
                     raise self._failure
@@ -392,14 +397,9 @@ class Session:
             first = self._first_seen.get(zlib.crc32(image.array.tobytes()), image.t_host)
             return first <= self._moved_s
 
-    def record_image(self, image: Image | None = None) -> None:
-        """Put an ultrasound frame into the recording, unless every frame goes there.
-
-        Args:
-            image: which one; None: the newest one, if there is any.
-        """
-        image = self.latest_image() if image is None else image
-        if image is not None and not self._every_frame:
+    def record_image(self, image: Image) -> None:
+        """Put an ultrasound frame into the recording, unless every frame goes there."""
+        if not self._every_frame:
             self._record_images([image])
 
     def _pump(self) -> None:

@@ -211,6 +211,29 @@ def test_a_frame_of_before_the_probe_came_to_rest_is_not_measured(tmp_path, monk
                         look(2)
 
 
+@pytest.mark.real_time
+def test_the_recorded_frame_of_a_slow_machine_is_of_the_pose(tmp_path):
+    """The newest one when a time of flight was measured could be from the end of the move."""
+    pytest.importorskip("rtde_control", reason="ur_rtde has no wheel for this platform")
+    with devices(tmp_path, version=CB_SERIES, speed=3.0) as (robot, _, recorder, setup):
+
+        def seen(t: float) -> np.ndarray:
+            return np.full((40, 30), round(1000.0 * robot.arm.raw(t)[0]) - 300, np.uint8)
+
+        with (
+            ImageServer(seen, clock=robot.clock, rate_hz=1.2) as machine,
+            Session(setup((machine.host, machine.port)), recorder) as session,
+            moving(robot, caller_s=2.0) as motion,
+        ):
+            session.image_after(robot.clock.now())
+            stage = ProbeStage(session, motion, PLAN.targets, lambda kind, text: None)
+            for row in (2, 0, 2):
+                stage.go_to(row)
+                frame = stage.any_frame()
+                assert frame is not None
+                assert frame.array[0, 0] == round(PLAN.targets[row][0, 3]) - 300
+
+
 class Odd(ImageServer):
     """Its stamps are in ms, and one image in four is lost."""
 
