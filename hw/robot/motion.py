@@ -51,7 +51,7 @@ from hw.robot.mover.messages import (
 )
 from hw.robot.path_checks import check_plan
 from hw.robot.stream import PoseSample
-from hw.runtime.clock import HELD_UP_WALL_S, REAL, Clock
+from hw.runtime.clock import HELD_UP_WALL_S, REAL, Clock, Waiting
 from hw.runtime.errors import DeviceError, LostError, StaleError, StoppedError, refused
 from hw.runtime.interrupts import heed_interrupt
 from hw.runtime.processes import finish, spawn
@@ -67,6 +67,8 @@ _START_PATIENCE_S, _START_TICK_S = 30.0, 0.1
 # The controller's watchdog has stopped the robot long before; a busy machine gets time to answer.
 _HANGS_WALL_S = 2.0
 _ENDING_WALL_S = 3.0
+_LOG_HANGS_WALL_S = 2.0
+"""A log that takes no line for so long during a motion stops the robot."""
 _NO_ANSWER = "the controller's answers are lost"
 _SUSPENDED_WALL_S = 10.0
 """After a longer suspension somebody may stand at the robot: it must not go on by itself."""
@@ -81,8 +83,9 @@ class Motion:
         confirmation: of that plan; used up by :meth:`start`. None only for a dry run.
         clock: bench time.
         dry_run: check and log, but send nothing to the robot.
-        log: called with every command before it is sent (of the watchdog's kicks only with their
-            number), every refusal and every stop. If it fails, the robot is stopped.
+        log: called with every command (of the watchdog's kicks only with their number), every
+            refusal and every stop, in a thread of its own. If it fails, or takes too long during a
+            motion, the robot is stopped.
         guard: see :data:`Guard`; may be set at any time.
         caller_s: bench seconds that this process may be silent during a motion, e.g. held up by
             another thread, before the motion is stopped: while it is silent, no guard is called. At
@@ -111,10 +114,13 @@ class Motion:
         self.serial: str | None = None
         self._confirmation = confirmation
         self._log = log or (lambda t, command, numbers: None)
+        self._to_log: queue.SimpleQueue[tuple[float, str, dict] | None] = queue.SimpleQueue()
+        self._noted = self._logged = 0
+        """Lines for the log so far, and those that it took."""
         between("caller_s", caller_s, 0.0, _SUSPENDED_WALL_S)
         self._caller_s = caller_s
         self._process: subprocess.Popen[bytes] | None = None
-        self._thread: threading.Thread | None = None
+        self._threads: list[threading.Thread] = []
         self._answers: queue.SimpleQueue[dict] = queue.SimpleQueue()
         self._sending = threading.Lock()
         self._one_at_a_time = threading.Lock()
@@ -170,8 +176,9 @@ class Motion:
                     self._write(setup)
                 finally:
                     unread.cancel()
-            self._thread = threading.Thread(target=self._receive, name="motion", daemon=True)
-            self._thread.start()
+            for work in (self._receive, self._keep_log):
+                self._threads.append(threading.Thread(target=work, name="motion", daemon=True))
+                self._threads[-1].start()
             deadline = time.monotonic() + _START_PATIENCE_S
             answer: dict = {}
             self._told = time.monotonic()
@@ -275,6 +282,7 @@ class Motion:
         hesitation: StaleError | None = None
         stopping: DeviceError | None = None
         silence: LostError | None = None
+        waiting, logged = Waiting(REAL), self._logged
         while True:
             asked_s = time.monotonic()
             try:
@@ -305,6 +313,10 @@ class Motion:
                     stopping = error
                 case "hung":
                     silence = LostError(_NO_ANSWER, device="robot")
+            if self._logged != logged or self._logged == self._noted:
+                waiting, logged = Waiting(REAL), self._logged
+            elif waiting.so_far() > _LOG_HANGS_WALL_S:
+                self.stop("commands cannot be logged: the disk is too slow, hangs or is full")
             # Asked also while the robot brakes for a hesitation: it may tell of a danger now.
             told_now = self._ask_guard()
             hesitation = hesitation or told_now
@@ -399,9 +411,9 @@ class Motion:
         assert self._process is not None
         self._process.kill()
         finish(self._process, _ENDING_WALL_S)
-        if self._thread is not None and self._thread is not threading.current_thread():
-            # It may wait for a log that hangs, as where the disk does.
-            self._thread.join(_ENDING_WALL_S)
+        for thread in self._threads:
+            # One may wait for a log that hangs, as where the disk does.
+            thread.join(_ENDING_WALL_S)
 
     def _send(self, message: dict) -> None:
         with self._sending:
@@ -430,6 +442,7 @@ class Motion:
             self._end_program()
             text += self._may_be_paused
             self._answers.put({"what": what, "kind": "LostError", "text": text, "ended": True})
+            self._to_log.put(None)
 
     def _end_program(self) -> None:
         """End the program of a process that ended without a word, as within a command (SIGALRM).
@@ -444,11 +457,18 @@ class Motion:
             self._may_be_paused = f"; {MAY_BE_PAUSED}"
 
     def _note(self, t: float, command: str, values: dict[str, object]) -> None:
-        try:
-            self._log(t, command, values)
-        except Exception as error:
-            # It runs in a thread that must go on: here nobody would see the exception.
-            self.stop(f"the log failed: {type(error).__name__}: {error}")
+        self._noted += 1
+        self._to_log.put((t, command, values))
+
+    def _keep_log(self) -> None:
+        """In a thread of its own: a log that waits for a disk holds up nothing else."""
+        for line in iter(self._to_log.get, None):
+            try:
+                self._log(*line)
+            except Exception as error:
+                # Here nobody would see the exception.
+                self.stop(f"the log failed: {type(error).__name__}: {error}")
+            self._logged += 1
 
     def _hear(self, message: dict) -> None:
         self._last_word |= message["what"] == "closed" or bool(message.get("ended"))

@@ -376,7 +376,7 @@ def test_a_log_that_fails_stops_the_robot():
 
 def test_a_log_that_hangs_does_not_hold_up_who_is_told_of_the_end(monkeypatch):
     """As where the disk hangs: the end of the motion was told only once the log went on."""
-    for name in ("_HANGS_WALL_S", "_ENDING_WALL_S"):
+    for name in ("_LOG_HANGS_WALL_S", "_ENDING_WALL_S"):
         monkeypatch.setattr(f"hw.robot.motion.{name}", 0.2)
     hanging = threading.Event()
 
@@ -389,12 +389,28 @@ def test_a_log_that_hangs_does_not_hold_up_who_is_told_of_the_end(monkeypatch):
         confirmed(robot, log=log, caller_s=2.0) as motion,
     ):
         began = time.monotonic()
-        text = "motion process does not respond; the robot's own watchdog stops it"
-        with pytest.raises(LostError, match=text):
+        with pytest.raises(StoppedError, match="cannot be logged: the disk is too slow, hangs or"):
             motion.move_to(PLAN.targets[2])
         assert time.monotonic() - began < 3.0
-        assert robot.state()["velocity"] == [0.0] * 6
+        # In order, and not by its watchdog.
+        assert robot.state()["reason"] == "the client stopped the script"
         hanging.set()
+
+
+def test_a_log_that_is_slow_at_rest_is_no_suspension(monkeypatch):
+    """A disk that took nothing for ten seconds ended the run, with this reason."""
+    monkeypatch.setattr("hw.robot.motion._SUSPENDED_WALL_S", 0.5)
+    slow = threading.Event()
+
+    def log(t: float, command: str, numbers: dict[str, object]) -> None:
+        if command == "isSteady" and not slow.is_set():
+            slow.set()
+            time.sleep(1.5)
+
+    with EmulatedRobot() as robot, confirmed(robot, log=log, caller_s=0.4) as motion:
+        motion.move_to(PLAN.targets[1])
+        time.sleep(1.2)
+        motion.move_to(HOME)
 
 
 def test_an_interrupt_within_what_an_interrupt_did_is_kept():
