@@ -22,6 +22,7 @@ from jaxcal.data.recording import (
     Images,
     Kind,
     Recording,
+    check_enough,
     checked_bound,
     checked_covariance,
     images_of,
@@ -42,7 +43,7 @@ from jaxcal.runtime.arrays import (
 )
 from jaxcal.runtime.given_values import refuse_masked
 from jaxcal.runtime.jax_modes import importing_jax, in_own_modes
-from jaxcal.runtime.messages import counted, shown
+from jaxcal.runtime.messages import shown
 from jaxcal.runtime.one_or_batch import OneOrBatch
 
 _ROUNDING = 1e-4
@@ -509,9 +510,7 @@ def check_values(problem: Problem) -> None:
     if not np.isin(mask, (0, 1)).all():
         raise InputError("mask of the problem must hold 1 (used) or 0 (left out) for every image")
     used = mask > 0
-    if used.sum() < MINIMUM_IMAGES:
-        few = counted(int(used.sum()), "used image", "is", "are")
-        raise InputError(f"{few} too few: at least {MINIMUM_IMAGES} are needed")
+    check_enough(used)
     poses = np.asarray(problem.poses)
     if not _are_rigid(poses[used]):
         check_poses(poses, used)  # says which is not, and why

@@ -22,6 +22,7 @@ from jaxcal.runtime.given_values import (
     is_number,
     real_array,
     refuse_masked,
+    shaped_array,
     truth_array,
     whole_number,
 )
@@ -390,9 +391,7 @@ def make_images(
         used = _mask(mask, count)
         if not (is_number(minimum) and minimum >= 0):
             raise InputError(f"minimum must be a number of images, not {shown(minimum)}")
-        if used.sum() < minimum:
-            few = counted(int(used.sum()), "used image", "is", "are")
-            raise InputError(f"{few} too few: at least {minimum} are needed")
+        check_enough(used, minimum)
         _check_magnitude("pose", poses, used)
         checked = check_poses(poses, used)
         values = used_values(kind, values, used)
@@ -427,6 +426,13 @@ def make_images(
         raise type(error)(f"{prefix}{error}") from None
 
 
+def check_enough(used: np.ndarray, minimum: int = MINIMUM_IMAGES) -> None:
+    """Raise InputError if fewer images are used than so many."""
+    if used.sum() < minimum:
+        few = counted(int(used.sum()), "used image", "is", "are")
+        raise InputError(f"{few} too few: at least {minimum} are needed")
+
+
 def _check_shape(values: np.ndarray, kind: Kind, count: int) -> None:
     if values.ndim != 2:
         several = " (one problem at a time: jaxcal.stack makes a batch)" if values.ndim == 3 else ""
@@ -443,13 +449,6 @@ def _refuse(name: str, bad: Any, what: str) -> None:
     if len(rows):
         several = f" (the first of {len(rows)}, counted from 0)" if len(rows) > 1 else ""
         raise InputError(f"{name} {rows[0]}{several} {what}")
-
-
-def _shaped(values: Any, name: str, shape: tuple[int, ...]) -> np.ndarray:
-    values = real_array(values, name)
-    if values.shape != shape:
-        raise InputError(f"{name} must have shape {shape}, it has {values.shape}")
-    return values
 
 
 def used_values(
@@ -614,7 +613,7 @@ def _per_image(
 ) -> Float[np.ndarray, " n"] | None:
     if values is None:
         return None
-    values = _shaped(values, name, (count,))
+    values = shaped_array(values, name, (count,))
     values[~used] = fill
     _refuse(name, ~np.isfinite(values), "is NaN or Inf")
     return values
@@ -623,7 +622,7 @@ def _per_image(
 def _velocity(values: np.ndarray | None, count: int) -> Float[np.ndarray, "n 6"] | None:
     if values is None:
         return None
-    values = _shaped(values, "velocity", (count, 6))
+    values = shaped_array(values, "velocity", (count, 6))
     _refuse("velocity", (np.abs(values) > LARGEST).any(axis=1), _BEYOND)
     return values
 
@@ -631,7 +630,7 @@ def _velocity(values: np.ndarray | None, count: int) -> Float[np.ndarray, "n 6"]
 def _frame(values: np.ndarray | None, count: int) -> Int[np.ndarray, " n"] | None:
     if values is None:
         return None
-    numbers = _shaped(values, "frame", (count,))
+    numbers = shaped_array(values, "frame", (count,))
     _refuse("frame", ~((numbers >= 0) & (numbers <= LARGEST_FRAME)), "is no number of a frame")
     _refuse("frame", numbers != np.round(numbers), "is no whole number")
     return numbers.astype(np.int64)
@@ -647,7 +646,7 @@ def checked_covariance(
     """
     if covariance is None:
         return None
-    values = _shaped(covariance, "covariance", (count, 2, 2))
+    values = shaped_array(covariance, "covariance", (count, 2, 2))
     values[~used] = np.eye(2)
     _check_magnitude("covariance", values, used)
     _refuse("covariance", ~np.isfinite(values).all(axis=(1, 2)), "holds NaN or Inf")

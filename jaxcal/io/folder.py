@@ -132,11 +132,10 @@ def rows_by_name(sequence: TrackedSequence, table: PoseTable) -> Int[np.ndarray,
     Raises:
         InputError: a name or number that no frame has; one line with file and line.
     """
-    if table.file is not None and (files := sequence.files):
+    if (named := table.file_names) is not None and (files := sequence.files):
         places = {Path(name).stem: index for index, name in enumerate(files)}
         # A whole name counts before another's without its ending.
         places |= {name: index for index, name in enumerate(files)}
-        named = [re.split(r"[/\\]", text)[-1] for text in table.file]
         unknown = [row for row, text in enumerate(named) if text not in places]
         if unknown:
             raise InputError(

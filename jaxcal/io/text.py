@@ -7,6 +7,7 @@ Blank lines and lines that start with ``#`` are skipped. A file is UTF-8 (or ASC
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Literal
@@ -83,6 +84,11 @@ class PoseTable:
 
     def __len__(self) -> int:
         return len(self.lines)
+
+    @property
+    def file_names(self) -> list[str] | None:
+        """Names of the images' files, without folders."""
+        return None if self.file is None else [re.split(r"[/\\]", name)[-1] for name in self.file]
 
     def of(self, kept: Int[np.ndarray, " m"]) -> PoseTable:
         """Some of its rows."""

@@ -32,7 +32,7 @@ from jaxcal.model.image_points import point_jacobian
 from jaxcal.model.unknowns import TABLE, tangent_names
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.arrays import outline
-from jaxcal.runtime.given_values import check_flag, real_array
+from jaxcal.runtime.given_values import check_flag, real_array, shaped_array
 from jaxcal.runtime.messages import shown
 
 SaveFormat = Literal["json", "plus", "slicer", "itk", "ros", "tusrec", "numpy"]
@@ -155,7 +155,7 @@ class ImageTransform:
         if given["image_plane_to_probe"] is None:
             raise InputError("image_plane_to_probe must be an array of real numbers")
         checked = {
-            name: _numbers(value, name, shapes[name])
+            name: shaped_array(value, name, shapes[name])
             for name, value in given.items()
             if value is not None
         }
@@ -433,13 +433,6 @@ class ImageTransform:
         from jaxcal.result import saved
 
         return saved.left_out(self, format)
-
-
-def _numbers(value: Any, name: str, shape: tuple[int, ...]) -> np.ndarray:
-    array = real_array(value, name)
-    if array.shape != shape:
-        raise InputError(f"{name} must have shape {shape}, it has {array.shape}")
-    return array
 
 
 def _image_points(value: Any, name: str) -> Float[np.ndarray, "n 2"]:

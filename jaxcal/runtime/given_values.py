@@ -36,6 +36,14 @@ def real_array(value: Any, name: str) -> np.ndarray:
     raise InputError(f"{name} must be an array of real numbers")
 
 
+def shaped_array(value: Any, name: str, shape: tuple[int, ...]) -> np.ndarray:
+    """:func:`real_array`; InputError where it has another shape."""
+    array = real_array(value, name)
+    if array.shape != shape:
+        raise InputError(f"{name} must have shape {shape}, it has {array.shape}")
+    return array
+
+
 def traceable_array(value: Any, name: str) -> Any:
     """:func:`real_array` of values; a traced array, which has none, is only made an array."""
     return array_module(value).asarray(value) if is_traced(value) else real_array(value, name)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import Literal
@@ -81,7 +80,7 @@ def _poses_of(
     """A pose for each point, whether it has one, the probe's velocities if known, and notes."""
     assert poses.poses is not None
     assert points.points is not None
-    of_file = _file_names(poses), _file_names(points)
+    of_file = poses.file_names, points.file_names
     for named, wanted in (of_file, (poses.frame, points.frame)):
         if named is not None and wanted is not None:
             places = _rows_by_image(poses, named)
@@ -187,11 +186,6 @@ def _unit_in_doubt(poses: PoseTable, points: PoseTable, track: PoseTrack) -> lis
 def _refuse_lag(lag_s: float | Literal["auto"]) -> None:
     if lag_s:
         raise InputError("--lag is for poses that are matched by time, with times in both tables")
-
-
-def _file_names(table: PoseTable) -> list[str] | None:
-    """Names of the images' files, without folders."""
-    return None if table.file is None else [re.split(r"[/\\]", name)[-1] for name in table.file]
 
 
 def _rows_by_image(table: PoseTable, images: Iterable[object]) -> dict[object, int]:
