@@ -32,7 +32,7 @@ MINIMUM_IMAGES = 4
 """With fewer used images nothing can be solved: 3 residuals an image against 9 unknowns."""
 
 MOST_IMAGES = 100_000
-"""Most images that a recording file may hold, and that are simulated."""
+"""Most images of a recording, in whatever file, and of a simulation."""
 
 LARGEST = 1e7
 """Largest coordinate accepted, in mm or px, and largest variance of one: ten kilometres."""

@@ -39,7 +39,8 @@ COVERING = 0.8
 _PASSES = 2
 """Largest number of passes of the exchange over all poses."""
 _SHORTLIST = 600
-_LEAST_GAIN = 1e-6
+LEAST_GAIN = 1e-6
+"""In ln of the criterion; for less no pose is exchanged or moved."""
 _TOGETHER = 256
 """Number of poses that are compared with the candidates at a time."""
 
@@ -267,7 +268,7 @@ def exchange(search: Search, chosen: Chosen) -> Chosen:
             open_to[[place[other] for other in rows]] = False
             open_to[place[row]] = True
             best = int(shortlist[np.argmax(np.where(open_to, value, -np.inf))])
-            if best == row or value[place[best]] - value[place[row]] < _LEAST_GAIN:
+            if best == row or value[place[best]] - value[place[row]] < LEAST_GAIN:
                 continue
             rows[k], moved = best, True
             information = without + search.information_of(best)

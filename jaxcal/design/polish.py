@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from jaxcal.data.geometry import matrix_from_rotation, rotation_from_vector
 from jaxcal.design.candidates import Candidates
 from jaxcal.design.constraints import Region
-from jaxcal.design.greedy import Chosen, Search, are_alike
+from jaxcal.design.greedy import LEAST_GAIN, Chosen, Search, are_alike
 from jaxcal.design.information import Model, covariance_of
 from jaxcal.runtime.jax_modes import in_own_modes
 
@@ -26,7 +26,6 @@ _STEPS = 8
 _HALVINGS = 5
 _FIRST_STEP = 0.25
 """In units of the extent: an eighth of the full range of region, cone and turns."""
-_LEAST_GAIN = 1e-6
 
 
 def pose_of(
@@ -129,7 +128,7 @@ def polish(search: Search, candidates: Candidates, chosen: Chosen) -> Float[np.n
             pose = bounds.poses(there[None], x, point)
             if bounds.keeps(pose, x, point)[0] and not among_too_many(k, pose[0]):
                 better, steeper = evaluate(there, known)
-                if better > value + _LEAST_GAIN:
+                if better > value + LEAST_GAIN:
                     return there, better, steeper, step, pose[0]
             step *= 0.5
         return None

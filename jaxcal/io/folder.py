@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxcal import FormatError, InputError
+from jaxcal.data.recording import MOST_IMAGES
 from jaxcal.io.given_files import one_line
 from jaxcal.io.png import png_size
 from jaxcal.io.sequence import FolderPixels, TrackedSequence
@@ -17,7 +18,6 @@ from jaxcal.io.text import PoseTable
 from jaxcal.runtime.array_types import Int
 from jaxcal.runtime.messages import quoted
 
-MOST_IMAGES = 100_000
 _OTHERS = {".bmp", ".gif", ".jpeg", ".jpg", ".pgm", ".tif", ".tiff"}
 """Endings of images that are not read."""
 PROBE_TO_TRACKER = ("Probe", "Tracker")

@@ -91,7 +91,6 @@ _SPELLINGS = {
 _FREE = "1"
 _PER_IMAGE = {"amplitude": _FREE, "time": "s", "max_elevation": "mm", "frame": _FREE}
 """Optional numbers, one an image, and their units."""
-_KINDS: tuple[Kind, ...] = ("point", "pixel", "time_of_flight")
 _POSE_FRAMES = ("pose_from", "pose_to")
 
 
@@ -270,7 +269,7 @@ def _area(kind: Kind) -> str:
 
 
 def _kind(node: Node) -> Kind:
-    found: list[Kind] = [kind for kind in _KINDS if child(node, kind) is not None]
+    found: list[Kind] = [kind for kind in get_args(Kind) if child(node, kind) is not None]
     if found == ["point", "time_of_flight"]:
         return "point"
     if len(found) != 1:

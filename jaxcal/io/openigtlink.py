@@ -55,7 +55,7 @@ _TRACKED = struct.Struct(">20sBB12f")
 _STATUS = struct.Struct(">Hq20s")
 _METADATA = struct.Struct(">HHI")
 _MOST_METADATA = 64
-_US_ASCII = 3
+US_ASCII = 3
 _TRANSFORM_STATUS = "TransformStatus"
 """Name under which PlusServer sends a status with a TRANSFORM."""
 _SMALL = 1 << 16
@@ -322,7 +322,7 @@ def _encode_status(status: str) -> tuple[bytes, bytes]:
     if not status:
         return b"", b""
     name, value = _TRANSFORM_STATUS.encode(), status.encode()
-    sizes = _METADATA.pack(len(name), _US_ASCII, len(value))
+    sizes = _METADATA.pack(len(name), US_ASCII, len(value))
     return (1).to_bytes(2, "big") + sizes, name + value
 
 

@@ -24,6 +24,7 @@ from jaxcal.io.message_content import ContentError
 from jaxcal.io.openigtlink import (
     HEADER_SIZE,
     PORT,
+    US_ASCII,
     Message,
     content_bytes,
     encode_header,
@@ -35,7 +36,6 @@ from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.messages import quoted
 
 _STRING = struct.Struct(">HH")
-_US_ASCII = 3
 _LONGEST_REPLY = 1 << 16
 _TIMEOUT_S = 10.0
 """Within this time the server must accept the connection and reply."""
@@ -68,7 +68,7 @@ def update_transform(
     where = f"{host}:{port}"
     number = 1 + secrets.randbelow(2**31 - 2)
     text = update_transform_command(frames, matrix, error_mm=error_mm).encode("ascii")
-    body = _STRING.pack(_US_ASCII, len(text)) + text
+    body = _STRING.pack(US_ASCII, len(text)) + text
     message = Message("STRING", f"CMD_{number}", time.time(), None)
     due = time.monotonic() + _TIMEOUT_S
     try:

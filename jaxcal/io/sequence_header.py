@@ -20,6 +20,7 @@ import numpy as np
 
 from jaxcal import FormatError, InputError
 from jaxcal.data.names import Orientation
+from jaxcal.data.recording import MOST_IMAGES
 from jaxcal.io.frame_names import FramePair, check_frames, split_name
 from jaxcal.io.given_files import one_line
 from jaxcal.io.pixel_stream import Packing, PixelStream
@@ -29,7 +30,6 @@ from jaxcal.runtime.messages import quoted
 
 MAXIMUM_HEADER = 64 * 2**20
 """Largest header, bytes: some 60,000 frames."""
-MOST_FRAMES = 100_000
 MOST_MATRICES = 1_000_000
 """Of all transforms in all frames: 128 MB."""
 LARGEST_FRAME = 2**26
@@ -61,8 +61,8 @@ class SequenceHeader:
         if found is None:
             raise FormatError(f"line {line}: {quoted(key)} does not name a frame and a field")
         number = int(found[1])
-        if number >= MOST_FRAMES:
-            raise FormatError(f"line {line}: frame {number}; at most {MOST_FRAMES} frames are read")
+        if number >= MOST_IMAGES:
+            raise FormatError(f"line {line}: frame {number}; at most {MOST_IMAGES} frames are read")
         of_frame = self.frames.setdefault(number, {})
         if found[2] in of_frame:
             raise FormatError(f"line {line}: {quoted(key)} is given twice")
@@ -133,8 +133,8 @@ def stated_pixel_size(axes: Iterable[str]) -> tuple[float, float] | None:
 
 def check_count(count: int, header: SequenceHeader) -> None:
     """Refuse absurd numbers of frames, and fields of frames that do not exist."""
-    if count > MOST_FRAMES:
-        raise FormatError(f"claims {count} frames; at most {MOST_FRAMES} are read")
+    if count > MOST_IMAGES:
+        raise FormatError(f"claims {count} frames; at most {MOST_IMAGES} are read")
     if count < 1:
         raise FormatError("holds no frames")
     beyond = [number for number in header.frames if number >= count]
@@ -210,8 +210,8 @@ def sequence_of(
 
 def check_written(transforms: Mapping[FramePair, np.ndarray], time: np.ndarray) -> None:
     """Refuse shapes, names and times that cannot be written."""
-    if time.ndim != 1 or not 0 < len(time) <= MOST_FRAMES:
-        raise InputError(f"1 to {MOST_FRAMES} time stamps are needed, not shape {time.shape}")
+    if time.ndim != 1 or not 0 < len(time) <= MOST_IMAGES:
+        raise InputError(f"1 to {MOST_IMAGES} time stamps are needed, not shape {time.shape}")
     if not np.isfinite(time).all():
         raise InputError(f"time stamp {np.flatnonzero(~np.isfinite(time))[0]} is NaN or Inf")
     milliseconds = np.round(time * 1e3)

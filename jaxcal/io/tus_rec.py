@@ -15,10 +15,11 @@ from pathlib import Path
 import numpy as np
 
 from jaxcal import FormatError, InputError
+from jaxcal.data.recording import MOST_IMAGES
 from jaxcal.io.given_files import check_readable, naming
 from jaxcal.io.lines import text_lines
 from jaxcal.io.sequence import Hdf5Pixels, TrackedSequence
-from jaxcal.io.sequence_header import LARGEST_FRAME, MOST_FRAMES
+from jaxcal.io.sequence_header import LARGEST_FRAME
 from jaxcal.io.table import finite_numbers
 from jaxcal.io.untrusted import UpTo, array, check_rows, child, open_root
 from jaxcal.runtime.array_types import Float
@@ -52,7 +53,7 @@ def read_scan(path: str | os.PathLike[str]) -> TrackedSequence:
             )
         if transforms is None:
             raise FormatError("is no scan of TUS-REC: /tforms is missing")
-        poses = array(transforms, (UpTo(MOST_FRAMES, "frames"), 4, 4))
+        poses = array(transforms, (UpTo(MOST_IMAGES, "frames"), 4, 4))
         if not len(poses):
             raise FormatError("holds no frames")
         frames = child(root, "frames")

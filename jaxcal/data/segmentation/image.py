@@ -27,6 +27,7 @@ from jaxtyping import Bool, Float
 
 from jaxcal import InputError
 from jaxcal.data.names import Target
+from jaxcal.data.recording import MOST_IMAGES
 from jaxcal.data.segmentation.speckle import (
     SMALLEST_REGION,
     Compression,
@@ -39,8 +40,6 @@ from jaxcal.data.segmentation.spot import Spot, brightest, fit_spot, half_maximu
 
 MAXIMUM_PIXELS = 2**24
 """Largest frame, px."""
-MAXIMUM_FRAMES = 100_000
-"""Most frames in one call."""
 LARGEST_SPOT = 0.25
 """A spot whose SD is more than this fraction of the region is a structure, not a target."""
 _LEAST_MARGIN_DB = 3.0
@@ -170,8 +169,8 @@ def _check_frames(frames: np.ndarray) -> np.ndarray:
             + ("; convert colour to grey first" if stack.ndim == 4 else "")
         )
     count, rows, columns = stack.shape
-    if count > MAXIMUM_FRAMES:
-        raise InputError(f"{count} frames are too many: at most {MAXIMUM_FRAMES} at a time")
+    if count > MOST_IMAGES:
+        raise InputError(f"{count} frames are too many: at most {MOST_IMAGES} at a time")
     if rows * columns > MAXIMUM_PIXELS:
         raise InputError(
             f"frames of {rows} x {columns} px are too large: at most {MAXIMUM_PIXELS} px"
