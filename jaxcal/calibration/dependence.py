@@ -394,6 +394,7 @@ def _with_group_averages(problem: Problem, found: IndependentImages) -> Problem:
         for name, values in before.items():
             after[name][kept] = values[rows].mean(axis=0)
         pose = after["poses"][kept]
+        # The mean of rotation matrices is no rotation.
         pose[:3, :3] = nearest_rotations(pose[None, :3, :3])[0][0]
         if len(rows) >= MEDIAN_FROM:
             after["measurements"][kept] = np.median(before["measurements"][rows], axis=0)

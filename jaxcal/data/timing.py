@@ -280,6 +280,7 @@ def _lower_envelope(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
     for i in range(len(x)):
         while len(hull) > 1:
             a, b = hull[-2], hull[-1]
+            # A corner lies below the line from the one before it to the new point.
             if (y[b] - y[a]) * (x[i] - x[a]) < (y[i] - y[a]) * (x[b] - x[a]):
                 break
             hull.pop()

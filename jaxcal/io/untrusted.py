@@ -66,9 +66,6 @@ def open_root(
             object.
         length: bytes that the file is to have, with zeros beyond its end; None: its own length.
 
-    Yields:
-        The root.
-
     Raises:
         FormatError: not HDF5, truncated, damaged, or being written.
     """

@@ -174,9 +174,6 @@ def run(
         label: what the program is, for ``jaxcal cache show``.
         convert: what to make of the result's arrays; by default numpy's.
 
-    Returns:
-        The function's result.
-
     Raises:
         NotDescribableError: arguments or plan hold what cannot be described.
         CalibrationError: this process was forked from one in which JAX had started.

@@ -353,6 +353,7 @@ class _ArrowSolver(LevenbergMarquardt):
         own = push(still, ones)
         diagonal, pull = jnp.sum(own**2, axis=1), jnp.sum(own * value, axis=1)
         coupling = jnp.einsum("anm,nm->na", jacobian, own)
+        # A local unknown at its bound stays there if a step down would lead beyond it.
         held = (y[1] >= self.limit) & (pull <= 0) | (y[1] <= -self.limit) & (pull >= 0)
         damped = jnp.where(diagonal > 0, diagonal * (1 + damping), 1.0)
         give = jnp.where(held | (diagonal <= 0), 0.0, 1 / damped)
@@ -361,6 +362,7 @@ class _ArrowSolver(LevenbergMarquardt):
         cost = jnp.sum(value**2)
         length = jnp.sqrt(diagonal * cost)
         cosine = jnp.abs(jnp.where(held, 0.0, pull)) / jnp.where(length > 0, length, 1.0)
+        # The Schur complement: local unknowns that are not held follow the shared ones.
         normal = _packed(
             shared - (coupling * give[:, None]).T @ coupling,
             gradient - (give * pull) @ coupling,

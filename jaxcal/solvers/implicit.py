@@ -149,9 +149,6 @@ def minimum(
         observation: the objective, with its SDs as functions of the data.
         images: the data.
         medium: prior of further unknowns, or None.
-
-    Returns:
-        The cost.
     """
     del iterate, observation, images, medium
     return cost

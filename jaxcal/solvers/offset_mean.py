@@ -143,6 +143,8 @@ def influences(
         beside = FurtherUnknowns.of(iterate, list(at[len(q) :]))
         return [each.errors for each in observation.components(list(at[: len(q)]), beside, images)]
 
+    # b's row a of the inverse turns an image's gradient J' W r at the minimum into the motion of b
+    # by this image. The sum of a' J' W J a over the images is b's variance, the last entry of a.
     still = jnp.zeros_like(mean)[:, None]
     here = [*q, *([still] * (iterate.unknowns - RIGID_UNKNOWNS))]
     values, to_minimum = jax.jvp(residuals, tuple(here), tuple(moved(step)))

@@ -103,6 +103,7 @@ def linear_proposals(
     def solve(system: Float[Array, "13 13"]) -> Parameters:
         ridge = 1e3 * jnp.finfo(system.dtype).eps * jnp.trace(system) / 13
         matrix = system[:12, :12] + ridge * jnp.eye(12, dtype=system.dtype)
+        # Two columns that nothing keeps orthonormal; then origin and target with a rotation held.
         columns = dense.solve_positive(matrix, system[:12, 12:])[:6, 0]
         first, third = columns[:3], columns[3:]
         sizes = jnp.stack([jnp.sqrt(jnp.sum(first**2)), jnp.sqrt(jnp.sum(third**2))])

@@ -221,6 +221,7 @@ class _Window:
         slopes = [none.copy(), none.copy(), np.full(du.shape, 2 * floor)]
         for log_height, log_a, log_b, c in unknowns[3:].reshape(-1, 4):
             a, b = np.exp(log_a), np.exp(log_b)
+            # As a triangular factor with a and b positive, the form stays positive definite.
             p, q = a * du + c * dv, b * dv
             part = np.exp(2 * log_height - p**2 - q**2)
             power += part

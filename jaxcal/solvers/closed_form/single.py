@@ -261,10 +261,12 @@ def _dual_maximum(
     for _ in range(DUAL_STEPS):
         value, inverse, x = state
         moved = constraints.matrices @ x
+        # The dual's slope is by how much the constraints are violated.
         slope = moved @ x - constraints.values
         if np.abs(slope).max() <= 1e-14 * max(1.0, float(x @ x)):
             break
         turned = moved @ inverse.T
+        # Minus the Hessian. It is singular where several multipliers give the same x.
         curvature = 2 * turned @ turned.T
         step = np.linalg.lstsq(curvature, slope, rcond=1e-15)[0]
         length, after = 1.0, None
