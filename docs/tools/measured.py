@@ -110,10 +110,9 @@ SETTINGS: dict[str, tuple[str, ...]] = {
         "0.25 to 4 mm",
     ),
     PLANNED: (
-        "2000 trials a cell (re-planned: 48), offsets of SD 1 mm, 0.5 mm of noise",
+        "2000 trials a cell (re-planned: 192), offsets of SD 1 mm, 0.5 mm of noise",
         "assumed 3 times too large",
-        "re-planning is no better with 12 images, and worse with 30 and 60 images",
-        "re-planning chooses from 1500 candidates, planning from 4000",
+        "planning anew after 8 and more images",
         "as good as 60 of the Sobol plan",
         "60 planned poses determine it",
         "400 recordings each of 12, 30 and 60 images, and ranges that are too long by 1 mm at 20 "
