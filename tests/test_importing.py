@@ -226,6 +226,21 @@ def test_headers_that_are_refused(names, message):
         columns_of_header(names, None)
 
 
+def test_times_of_a_moving_probe_that_may_be_ms_are_named(tmp_path):
+    poses = np.tile(np.eye(4), (30, 1, 1))
+    for name, step_s, moving, doubt in [
+        ("time", 40.0, True, True),
+        ("time", 0.04, True, False),
+        ("time [ms]", 40.0, True, False),
+        ("time", 40.0, False, False),
+    ]:
+        way = np.arange(30.0) if moving else np.random.default_rng(1).permutation(30) * 1.0
+        poses[:, 0, 3] = 100.0 + way
+        columns = [step_s * np.arange(30), poses[:, :3].reshape(-1, 12), np.full((30, 2), 50.0)]
+        notes = imported(tmp_path, table([name, *MATRIX, "u", "v"], columns))[1]
+        assert ["in ms, us or ns?" in note for note in notes] == [True] * doubt
+
+
 @pytest.mark.parametrize("prefix", ["r", "rot_"])
 def test_four_numbers_of_a_rotation_are_a_quaternion(prefix):
     names = [*NAMES[:5], *(prefix + axis for axis in "wxyz")]

@@ -16,6 +16,10 @@ from jaxcal.io.importing.two_tables import one_of_two_tables
 from jaxcal.io.table import first_line
 from jaxcal.io.text import MATRIX_WIDTHS, PoseTable, read_pair, recording_of, width_without_header
 
+_FEWEST, _LONG_S, _SMALL_STEP = 20, 5.0, 0.25
+"""The unit of times is in doubt if so many images are so far apart, but the probe moves from image
+to image by less than this share of the distance of images half a recording apart."""
+
 
 def from_tables(sources: Sequence[str | os.PathLike[str]], options: ImportOptions) -> Imported:
     """The recording of one table, of a table with poses and one with points, or of the pair."""
@@ -81,6 +85,22 @@ def _selected_rows(table: PoseTable, options: ImportOptions) -> tuple[PoseTable,
     return (table.of(np.flatnonzero(chosen)) if told else table), told
 
 
+def _unit_in_doubt(table: PoseTable, track: PoseTrack) -> list[str]:
+    """A note if a probe that moves on has images many s apart; no lag would be found in them."""
+    if table.time_stated or len(table) < _FEWEST or track.interval_s < _LONG_S:
+        return []
+    at = track.poses[:, :3, 3]
+    step = np.median(np.linalg.norm(np.diff(at, axis=0), axis=1))
+    apart = np.median(np.linalg.norm(at - np.roll(at, len(at) // 2, axis=0), axis=1))
+    if step > _SMALL_STEP * apart:
+        return []
+    return [
+        f"images of {table.name} are {track.interval_s:.3g} s apart if times are in s (no header "
+        "states their unit), and the probe hardly moves between them: are they in ms, us or ns? "
+        "Name the column time [ms], [us], [ns] or [s]"
+    ]
+
+
 def _from_table(table: PoseTable, notes: list[str], lost: int, options: ImportOptions) -> Imported:
     """The recording of a table with poses and points; ``lost`` further points have no pose."""
     if table.time is None and options.ignore_time:
@@ -92,6 +112,7 @@ def _from_table(table: PoseTable, notes: list[str], lost: int, options: ImportOp
         if poses is not None and time is not None and len(time) > 1 and table.velocity is None:
             track = PoseTrack(time, poses, np.ones(len(time), bool), table.name)
             table = replace(table, velocity=track.velocities(time))
+            notes = notes + _unit_in_doubt(table, track)
     with naming_pose_units(options, table.length_stated):
         recording = recording_of(table, options.spacing_mm, options.minimum)
     return Imported(recording, notes, most_lost=len(table) < lost)
