@@ -96,7 +96,7 @@ def certify(
     if found.certified:
         return found
     relaxed = lower_bound(reduced, x, 0.3 * tolerance(reduced, found.objective_mm2))
-    gap = np.inf if relaxed is None else relaxed.gap
+    gap = np.inf if relaxed is None else relaxed[0]
     return certify_point(reduced, x, excess=excess, gap=gap)
 
 

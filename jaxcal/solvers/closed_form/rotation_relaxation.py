@@ -38,19 +38,6 @@ MOST_STEPS = 300
 """Most steps of the interior-point method."""
 
 
-@dataclass(frozen=True)
-class Relaxation:
-    """What the program proves.
-
-    Attributes:
-        gap: f at the given x less the proved bound, in f's unit; never negative.
-        x: (6,), the relaxation's estimate of the minimiser; it need not be a rotation.
-    """
-
-    gap: float
-    x: Float[np.ndarray, " 6"]
-
-
 @cache
 def _equations(scaled: bool) -> Float[np.ndarray, "m v v"]:
     """Orthonormal basis of the matrices B_j; with a common scale, s takes the place of 1."""
@@ -129,8 +116,10 @@ class _Program:
             least = float(np.linalg.eigvalsh(squared)[0])
             if least < 1e-12:
                 return None
+            # s^2 - |a1|^2 + |a2|^2 - |a3|^2 = 0; F has at least ``least`` along a1 and a3.
             shape[1:] = least * np.array([0.5, *[-0.5] * 3, *[0.5] * 3, *[-0.5] * 3])
         else:
+            # |a1|^2 + |a2|^2 + |a3|^2 - 3 = 0.
             shape[1:] = 1.0
             shape[0] = -3.0
         start = np.diag(shape)
@@ -151,7 +140,7 @@ class _Program:
 
 def lower_bound(
     reduced: ReducedObjective, x: Float[np.ndarray, " 6"], enough: float
-) -> Relaxation | None:
+) -> tuple[float, Float[np.ndarray, " 6"]] | None:
     """Bound f from below.
 
     Args:
@@ -160,8 +149,9 @@ def lower_bound(
         enough: stop when the gap is below this, mm^2.
 
     Returns:
-        None where there is no such relaxation: a lateral or axial scale of its own, a common scale
-        with a singular factor, or a factor of zero.
+        f(x) less the proved bound, mm^2, never negative; and an estimate of the minimiser, which
+        need not be of a rotation. None where there is no such relaxation: a lateral or axial scale
+        of its own, a common scale with a singular factor, or a factor of zero.
     """
     program = _Program.of(reduced, x)
     if program is None:
@@ -170,7 +160,7 @@ def lower_bound(
     inverse = np.linalg.inv(lower)
     moments = inverse.T @ inverse
     ideal = moments[program.where, 0] / moments[0, 0]
-    return Relaxation(max(gap, 0.0) * program.unit, ideal)
+    return max(gap, 0.0) * program.unit, ideal
 
 
 def _least_gap(program: _Program, enough: float) -> tuple[float, Float[np.ndarray, "v v"]]:

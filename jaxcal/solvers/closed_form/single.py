@@ -197,10 +197,11 @@ def solve(reduced: ReducedObjective) -> tuple[Float[np.ndarray, " 6"], Certifica
     relaxed = lower_bound(reduced, best, 0.3 * enough)
     if relaxed is None:
         return best, certificate
+    gap, ideal = relaxed
     # The relaxation's estimate of the minimiser is one more start.
-    again = descend(reduced, feasible(relaxed.x, constraints)[None])
+    again = descend(reduced, feasible(ideal, constraints)[None])
     gained = float(reduced(best) - reduced(again))
-    best, gap = (again, relaxed.gap - gained) if gained > 0 else (best, relaxed.gap)
+    best, gap = (again, gap - gained) if gained > 0 else (best, gap)
     return best, certify_point(reduced, best, gap=max(gap, 0.0))
 
 
