@@ -8,13 +8,13 @@ import threading
 from dataclasses import dataclass, field
 from functools import cached_property
 
-from hw.robot.limits import between
 from hw.robot.motion_plan import MotionPlan
 from hw.robot.path_checks import check_plan
 from hw.runtime.clock import Clock, asleep_s
 from hw.runtime.errors import refused
 
 _VALID_S = 600.0
+"""Bench seconds within which motion must be started."""
 LEAST_DIGEST_DIGITS = 16
 
 
@@ -67,16 +67,13 @@ class Challenge:
         return hashlib.sha256(self.nonce + self.plan.digest.encode()).hexdigest()[:8]
 
 
-def confirm(
-    challenge: Challenge, answer: str, *, clock: Clock, valid_s: float = _VALID_S
-) -> Confirmation:
+def confirm(challenge: Challenge, answer: str, *, clock: Clock) -> Confirmation:
     """Take the operator's confirmation of a plan.
 
     Args:
         challenge: the one that the operator was shown.
         answer: what the operator typed; must be ``challenge.code``.
         clock: bench time.
-        valid_s: bench seconds within which motion must be started.
 
     Raises:
         RefusedError: another answer, or a challenge that was answered before.
@@ -85,12 +82,10 @@ def confirm(
         raise refused("not confirmed: the code typed is not the one shown")
     if not challenge.use.acquire(blocking=False):
         raise refused("this code was typed before; each run has a code of its own")
-    return _confirmation(challenge.plan, clock, valid_s, unattended=False)
+    return _confirmation(challenge.plan, clock, unattended=False)
 
 
-def confirm_unattended(
-    plan: MotionPlan, digest: str, *, clock: Clock, valid_s: float = _VALID_S
-) -> Confirmation:
+def confirm_unattended(plan: MotionPlan, digest: str, *, clock: Clock) -> Confirmation:
     """Confirm a plan that somebody has named beforehand; nobody is asked, now or later.
 
     What is lost: no person who sees the robot says, just before it moves, that nobody and nothing
@@ -100,7 +95,6 @@ def confirm_unattended(
         plan: the plan to confirm; it is checked first.
         digest: the plan's, at least its first :data:`LEAST_DIGEST_DIGITS` digits.
         clock: bench time.
-        valid_s: bench seconds within which motion must be started.
 
     Raises:
         RefusedError: the plan is not allowed, or is not the one named.
@@ -115,12 +109,9 @@ def confirm_unattended(
             f"{plan.digest[:LEAST_DIGEST_DIGITS]} (poses, limits, robot, TCP offset, payload and "
             "speed slider are part of it)"
         )
-    return _confirmation(plan, clock, valid_s, unattended=True)
+    return _confirmation(plan, clock, unattended=True)
 
 
-def _confirmation(
-    plan: MotionPlan, clock: Clock, valid_s: float, *, unattended: bool
-) -> Confirmation:
-    between("valid_s", valid_s, 0.0, 24 * 3600.0)
+def _confirmation(plan: MotionPlan, clock: Clock, *, unattended: bool) -> Confirmation:
     now = clock.now()
-    return Confirmation(plan.digest, plan.serial, now, now + valid_s, asleep_s(), unattended)
+    return Confirmation(plan.digest, plan.serial, now, now + _VALID_S, asleep_s(), unattended)

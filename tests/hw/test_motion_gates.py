@@ -281,7 +281,8 @@ def test_a_plan_goes_on_after_its_confirmation_has_expired():
         named = {"clock": robot.clock, "dry_run": False, "caller_s": 2.0}
         # A busy machine may take longer to connect.
         for valid_s in (2.0, 6.0, 60.0):
-            given = confirm_unattended(plan, plan.digest, clock=robot.clock, valid_s=valid_s)
+            given = confirm_unattended(plan, plan.digest, clock=robot.clock)
+            given = replace(given, expires_s=given.issued_s + valid_s)
             motion = Motion(robot.host, plan, given, **named)
             with suppress(RefusedError):
                 motion.start()
