@@ -413,7 +413,8 @@ class Motion:
         finish(self._process, _ENDING_WALL_S)
         for thread in self._threads:
             # One may wait for a log that hangs, as where the disk does.
-            thread.join(_ENDING_WALL_S)
+            if thread is not threading.current_thread():
+                thread.join(_ENDING_WALL_S)
 
     def _send(self, message: dict) -> None:
         with self._sending:
