@@ -19,6 +19,7 @@ import threading
 import time
 import zlib
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -131,6 +132,7 @@ class ActiveEcho:
         self._anchor: tuple[float, int, float] | None = None
         self._tick_s = 0.0
         self._failure: LostError | None = None
+        self._threshold: int | None = None
         self._stopping = False
         self._transport = open_transport(url)
         self._reader = threading.Thread(target=self._read_on, name="active echo", daemon=True)
@@ -184,6 +186,21 @@ class ActiveEcho:
                 f"threshold must be 0 to {MAXIMUM_THRESHOLD}, not {threshold}", device=DEVICE
             )
         self._ask("THR", str(threshold), expected=str(threshold))
+        self._threshold = threshold
+
+    def check_threshold(self, frames: Sequence[EchoFrame]) -> None:
+        """Check that frames, which began after the threshold was set, were taken at it.
+
+        Raises:
+            DeviceError: they were not: amplitudes and lines that answered mean something else.
+        """
+        for frame in frames:
+            if self._threshold not in (None, frame.threshold):
+                raise DeviceError(
+                    f"the threshold was set to {self._threshold}, but is {frame.threshold}: was "
+                    "the device restarted, or the threshold set by hand?",
+                    device=DEVICE,
+                )
 
     def threshold(self) -> int:
         """Threshold in force, counts."""

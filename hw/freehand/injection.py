@@ -221,6 +221,7 @@ class _Run(Run):
         elif now - self._heard > SILENCE_S:
             raise StaleError(f"no frame for {SILENCE_S:g} s: {SILENT}", device="active echo")
         self.recorder.add_echo(frames)
+        self.echo.check_threshold(frames)
         if frames:
             self._late_s = frames[-1].late_s
         # Not those whose delay is not known (NaN).

@@ -318,12 +318,12 @@ class Session:
 
         Args:
             frames: how many, at most :data:`~hw.midplane.search.MOST_FRAMES`.
-            since: bench time. A frame is assumed to have begun before its arrival by its delay, or
-                by the stream's period (:func:`frame_period`) if that is longer; a frame whose delay
-                is not known is not taken.
+            since: bench time, after the threshold was set. A frame is assumed to have begun before
+                its arrival by its delay, or by the stream's period (:func:`frame_period`) if that
+                is longer; a frame whose delay is not known is not taken.
 
         Raises:
-            DeviceError: trouble while waiting.
+            DeviceError: trouble while waiting, or another threshold.
         """
         began = self.clock.now()
         if began - self._delay_measured > DELAY_S:
@@ -342,6 +342,7 @@ class Session:
                         f for f in self._echo_frames if f.t_host - max(f.late_s, period) > since
                     ]
                 if len(found) >= frames:
+                    self.echo.check_threshold(found[:frames])
                     return found[:frames]
                 if self._failure is not None:
                     raise self._failure

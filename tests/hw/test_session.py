@@ -146,6 +146,16 @@ def test_a_question_that_was_held_up_does_not_end_the_run(tmp_path):
         session.wait_until_clear()
 
 
+def test_a_threshold_that_is_not_the_one_set_is_named(tmp_path):
+    """By hand, or by a restart: its lines and amplitudes went into the placement as any others."""
+    with devices(tmp_path) as (_, emulator, recorder, setup), Session(setup(), recorder) as session:
+        session.echo.set_threshold(100)
+        assert len(session.listen(3, session.clock.now())) == 3
+        emulator.threshold = 700
+        with pytest.raises(DeviceError, match="was set to 100, but is 700: was the device rest"):
+            session.listen(3, session.clock.now())
+
+
 def test_an_image_that_a_slow_link_holds_up_is_not_of_the_next_pose(tmp_path):
     """The robot arrived after it was made: a target's place was measured at the wrong pose."""
     with (
