@@ -8,7 +8,7 @@ confirmation is needed. A protective stop is reported; this software never relea
 A stop is latched on both sides of the pipe: here in :attr:`Motion._stop`, in the other process as
 described in :mod:`hw.robot.mover.control_loop`. There are two kinds of stops.
 
-- A *stop* (:meth:`Motion.stop`, a guard that reports danger or fails, a log that fails, an
+- A *stop* (:meth:`Motion.stop`, a guard that reports danger or fails, a log that fails or hangs, an
   interrupt such as Ctrl-C, a suspension of this process for more than 10 s, force, speed, the box,
   a protective stop, a motion that does not arrive) ends motion: :attr:`Motion.ended` is true, every
   later move is refused, and only a new confirmation lets the robot move again.
