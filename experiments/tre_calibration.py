@@ -157,8 +157,8 @@ def scales(trials: int, folder: Path) -> list[list[object]]:
         ("joint", "auto", MIXTURE),
     )
     conditions: list[tuple[tuple[str, ...], Method, PriorName, LawName, int, str]] = []
-    for way, images, field in itertools.product(ways, (12, 30, 60), FIELDS):
-        conditions.append((("scale",), *way, images, field))
+    for (method, prior, law), images, field in itertools.product(ways, (12, 30, 60), FIELDS):
+        conditions.append((("scale",), method, prior, law, images, field))
     media = (("sound-speed",), ("delay",), ("sound-speed", "delay"))
     for medium, field in itertools.product(media, FIELDS):
         conditions.append((medium, "joint", "gaussian", "normal", 20, field))
