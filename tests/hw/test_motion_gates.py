@@ -208,6 +208,11 @@ def test_a_robot_that_may_not_move_is_sent_nothing_and_its_state_is_named():
             with pytest.raises(RefusedError, match=text), moving(robot):
                 pass
         robot.ask("robot_state", 7, 2)
+        robot.ask("bits", 4, 0)
+        with pytest.raises(RefusedError, match="freedrive button is pressed"), moving(robot):
+            pass
+        # The input of an enabling device is no reason.
+        robot.ask("bits", 0, 1 << 11)
         robot.ask("remote", False)
         with pytest.raises(RefusedError, match="local control: switch it to remote"), moving(robot):
             pass

@@ -17,7 +17,15 @@ from hw.robot.mover.messages import DASHBOARD_STOP, MAY_BE_PAUSED, Setup
 from hw.robot.mover.no_reconnect import NoReconnect
 from hw.robot.mover.program import guarded_program, send_program
 from hw.robot.path_checks import check_plan
-from hw.robot.rtde import PORT, PROGRAM_RUNS, PacketReader, check_latency, safety_text, state_text
+from hw.robot.rtde import (
+    FREEDRIVE_PRESSED,
+    PORT,
+    PROGRAM_RUNS,
+    PacketReader,
+    check_latency,
+    safety_text,
+    state_text,
+)
 from hw.runtime.clock import Lag
 from hw.runtime.errors import LostError, refused
 from hw.runtime.extras import require
@@ -140,6 +148,8 @@ class Connection:
         packet = self._inputs.packet
         problem = LOCAL if remote is False else ""
         problem = problem or state_text(packet.robot_mode, packet.safety_bits)
+        if not problem and packet.status_bits & FREEDRIVE_PRESSED:
+            problem = "the freedrive button is pressed: somebody guides the arm"
         # The program of a connection that was lost ends by its watchdog.
         give_up = self._clock.now() + self._clock.patience(1.1 / IDLE_WATCHDOG_HZ)
         while not problem and self._inputs.packet.program:
