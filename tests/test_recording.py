@@ -9,6 +9,7 @@ import h5py
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import random_poses
 
 import jaxcal
 from jaxcal import InputError, design
@@ -39,6 +40,14 @@ def test_rows_above_the_image_are_refused():
         jaxcal.make_images(
             given["poses"], changed, "pixel", spacing_mm=(0.12, 0.1), face_offset_mm=-1.5
         )
+
+
+def test_pixels_as_shares_of_the_image_are_refused():
+    pixels = np.random.default_rng(1).uniform(0.1, 0.9, (6, 2))
+    with pytest.raises(InputError, match="shares of the image's width and height"):
+        jaxcal.make_images(random_poses(6), pixels, "pixel")
+    jaxcal.make_images(random_poses(6), 2 * pixels + 1, "pixel")
+    jaxcal.make_images(random_poses(6), pixels, "point")
 
 
 def test_numbers_of_jax_that_numpy_does_not_know_are_numbers():

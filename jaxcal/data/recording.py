@@ -485,6 +485,11 @@ def used_values(
             "image, where v = 0; are u and v exchanged, or counted from the image's middle, or "
             "does it mark an image without the target (leave that one out)?"
         )
+    if used.sum() >= MINIMUM_IMAGES and np.abs(values[used]).max() < 1:
+        raise InputError(
+            "all u and v are below 1: if they are shares of the image's width and height, multiply "
+            "them by its columns and rows"
+        )
     return values
 
 

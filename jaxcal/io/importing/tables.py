@@ -49,7 +49,7 @@ def from_tables(sources: Sequence[str | os.PathLike[str]], options: ImportOption
     else:
         table = read_rows(sources[0], options, ignore_time=options.ignore_time)
     table, told = _selected_rows(table, options)
-    return _from_table(table, table.notes + told, 0, options)
+    return _from_table(table, table.notes + told + _unit_in_doubt(table), 0, options)
 
 
 def _is_pair(sources: Sequence[str | os.PathLike[str]]) -> bool:
@@ -85,17 +85,20 @@ def _selected_rows(table: PoseTable, options: ImportOptions) -> tuple[PoseTable,
     return (table.of(np.flatnonzero(chosen)) if told else table), told
 
 
-def _unit_in_doubt(table: PoseTable, track: PoseTrack) -> list[str]:
+def _unit_in_doubt(table: PoseTable) -> list[str]:
     """A note if a probe that moves on has images many s apart; no lag would be found in them."""
-    if table.time_stated or len(table) < _FEWEST or track.interval_s < _LONG_S:
+    if table.time is None or table.poses is None or table.time_stated or len(table) < _FEWEST:
         return []
-    at = track.poses[:, :3, 3]
+    interval_s = np.median(np.diff(table.time))
+    if interval_s < _LONG_S:
+        return []
+    at = table.poses[:, :3, 3]
     step = np.median(np.linalg.norm(np.diff(at, axis=0), axis=1))
     apart = np.median(np.linalg.norm(at - np.roll(at, len(at) // 2, axis=0), axis=1))
     if step > _SMALL_STEP * apart:
         return []
     return [
-        f"images of {table.name} are {track.interval_s:.3g} s apart if times are in s (no header "
+        f"images of {table.name} are {interval_s:.3g} s apart if times are in s (no header "
         "states their unit), and the probe hardly moves between them: are they in ms, us or ns? "
         "Name the column time [ms], [us], [ns] or [s]"
     ]
@@ -112,7 +115,6 @@ def _from_table(table: PoseTable, notes: list[str], lost: int, options: ImportOp
         if poses is not None and time is not None and len(time) > 1 and table.velocity is None:
             track = PoseTrack(time, poses, np.ones(len(time), bool), table.name)
             table = replace(table, velocity=track.velocities(time))
-            notes = notes + _unit_in_doubt(table, track)
     with naming_pose_units(options, table.length_stated):
         recording = recording_of(table, options.spacing_mm, options.minimum)
     return Imported(recording, notes, most_lost=len(table) < lost)
