@@ -76,7 +76,7 @@ def test_frames_of_frozen_tracking_are_left_out(frames):
     np.testing.assert_array_equal(np.flatnonzero(joined.mask == 0), [7, 8, 9, 20, 21, 23, 24])
     np.testing.assert_allclose(joined.measurements[22], points[20])
     assert "left out 3 images, counted from 0" in found.words[0]
-    assert found.words[0].endswith("7, 8, 9")
+    assert found.words[0].endswith(": 7 to 9")
     result = jaxcal.calibrate(problem, "conventional")
     assert found.words[0] in result.warnings
 
