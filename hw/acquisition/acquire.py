@@ -266,7 +266,7 @@ class _Run:
         self.say(f"{kind}: {text}")
 
     def _log(self, t: float, command: str, numbers: dict[str, object]) -> None:
-        # Runs in the thread that hears the motion process; the recorder keeps its own error.
+        # Runs in a thread of its own; the recorder keeps its own error.
         with suppress(CalibrationError):
             self.recorder.add_event("command", f"{command} {json.dumps(numbers)}", t)
 

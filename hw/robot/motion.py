@@ -117,6 +117,8 @@ class Motion:
         self._to_log: queue.SimpleQueue[tuple[float, str, dict] | None] = queue.SimpleQueue()
         self._noted = self._logged = 0
         """Lines for the log so far, and those that it took."""
+        self._log_waited, self._logged_then = Waiting(REAL), 0
+        """How long it has taken none of those that wait, over all motions; and how many it had."""
         between("caller_s", caller_s, 0.0, _SUSPENDED_WALL_S)
         self._caller_s = caller_s
         self._process: subprocess.Popen[bytes] | None = None
@@ -282,7 +284,6 @@ class Motion:
         hesitation: StaleError | None = None
         stopping: DeviceError | None = None
         silence: LostError | None = None
-        waiting, logged = Waiting(REAL), self._logged
         while True:
             asked_s = time.monotonic()
             try:
@@ -313,9 +314,9 @@ class Motion:
                     stopping = error
                 case "hung":
                     silence = LostError(_NO_ANSWER, device="robot")
-            if self._logged != logged or self._logged == self._noted:
-                waiting, logged = Waiting(REAL), self._logged
-            elif waiting.so_far() > _LOG_HANGS_WALL_S:
+            if self._logged != self._logged_then or self._logged == self._noted:
+                self._log_waited, self._logged_then = Waiting(REAL), self._logged
+            elif self._log_waited.so_far() > _LOG_HANGS_WALL_S:
                 self.stop("commands cannot be logged: the disk is too slow, hangs or is full")
             # Asked also while the robot brakes for a hesitation: it may tell of a danger now.
             told_now = self._ask_guard()

@@ -397,6 +397,26 @@ def test_a_log_that_hangs_does_not_hold_up_who_is_told_of_the_end(monkeypatch):
         hanging.set()
 
 
+def test_a_log_that_hangs_over_short_moves_is_noticed(monkeypatch):
+    """Each move began to wait anew: none of many short ones was stopped."""
+    monkeypatch.setattr("hw.robot.motion._LOG_HANGS_WALL_S", 1.5)
+    monkeypatch.setattr("hw.robot.motion._ENDING_WALL_S", 0.2)
+    hanging = threading.Event()
+
+    def log(t: float, command: str, numbers: dict[str, object]) -> None:
+        if command == "moveL":
+            hanging.wait(30.0)
+
+    def move_on(motion: Motion) -> None:
+        for row in (1, 0) * 5:
+            motion.move_to(PLAN.targets[row])
+
+    with EmulatedRobot(speed=3.0) as robot, confirmed(robot, log=log, caller_s=6.0) as motion:
+        with pytest.raises(StoppedError, match="commands cannot be logged"):
+            move_on(motion)
+        hanging.set()
+
+
 def test_a_log_that_is_slow_at_rest_is_no_suspension(monkeypatch):
     """A disk that took nothing for ten seconds ended the run, with this reason."""
     monkeypatch.setattr("hw.robot.motion._SUSPENDED_WALL_S", 0.5)
