@@ -103,7 +103,7 @@ def safety_text(bits: int) -> str:
 def state_text(robot_mode: int, safety_bits: int) -> str:
     """Why the robot may not move, and what a person must do; an empty string when it may."""
     problem = safety_text(safety_bits)
-    if not problem and not safety_bits & NORMAL_BITS:
+    if not problem and robot_mode == RUNNING_MODE and not safety_bits & NORMAL_BITS:
         problem = "the robot reports no safety state: check the pendant"
     if problem or robot_mode == RUNNING_MODE:
         return problem

@@ -390,6 +390,8 @@ def test_safety_bits_are_named():
     assert state_text(7, 0b01 | 1 << 11) == state_text(7, 0b10 | 1 << 11) == ""
     assert safety_text(0b100 | 1 << 11).startswith("protective stop")
     assert "no safety state" in state_text(7, 0) == state_text(7, 1 << 11)
+    # One that boots has none yet: its mode says more.
+    assert "it is booting" in state_text(2, 0)
     assert "0x80000000" in safety_text(1 << 31)
 
 
