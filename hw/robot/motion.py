@@ -67,8 +67,8 @@ _START_PATIENCE_S, _START_TICK_S = 30.0, 0.1
 # The controller's watchdog has stopped the robot long before; a busy machine gets time to answer.
 _HANGS_WALL_S = 2.0
 _ENDING_WALL_S = 3.0
-_LOG_HANGS_WALL_S = 2.0
-"""A log that takes no line for so long during a motion stops the robot."""
+_LOG_BEHIND_WALL_S = 2.0
+"""A log that takes a line so much too late, or not at all, during motions stops the robot."""
 _NO_ANSWER = "the controller's answers are lost"
 _SUSPENDED_WALL_S = 10.0
 """After a longer suspension somebody may stand at the robot: it must not go on by itself."""
@@ -117,8 +117,8 @@ class Motion:
         self._to_log: queue.SimpleQueue[tuple[float, str, dict] | None] = queue.SimpleQueue()
         self._noted = self._logged = 0
         """Lines for the log so far, and those that it took."""
-        self._log_waited, self._logged_then = Waiting(REAL), 0
-        """How long it has taken none of those that wait, over all motions; and how many it had."""
+        self._log_waited, self._log_due = Waiting(REAL), 0
+        """For how long, over all motions, it has not taken all lines up to this number."""
         between("caller_s", caller_s, 0.0, _SUSPENDED_WALL_S)
         self._caller_s = caller_s
         self._process: subprocess.Popen[bytes] | None = None
@@ -314,9 +314,9 @@ class Motion:
                     stopping = error
                 case "hung":
                     silence = LostError(_NO_ANSWER, device="robot")
-            if self._logged != self._logged_then or self._logged == self._noted:
-                self._log_waited, self._logged_then = Waiting(REAL), self._logged
-            elif self._log_waited.so_far() > _LOG_HANGS_WALL_S:
+            if self._logged >= self._log_due:
+                self._log_waited, self._log_due = Waiting(REAL), self._noted
+            elif self._log_waited.so_far() > _LOG_BEHIND_WALL_S:
                 self.stop("commands cannot be logged: the disk is too slow, hangs or is full")
             # Asked also while the robot brakes for a hesitation: it may tell of a danger now.
             told_now = self._ask_guard()

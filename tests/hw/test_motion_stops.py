@@ -376,7 +376,7 @@ def test_a_log_that_fails_stops_the_robot():
 
 def test_a_log_that_hangs_does_not_hold_up_who_is_told_of_the_end(monkeypatch):
     """As where the disk hangs: the end of the motion was told only once the log went on."""
-    for name in ("_LOG_HANGS_WALL_S", "_ENDING_WALL_S"):
+    for name in ("_LOG_BEHIND_WALL_S", "_ENDING_WALL_S"):
         monkeypatch.setattr(f"hw.robot.motion.{name}", 0.2)
     hanging = threading.Event()
 
@@ -397,15 +397,15 @@ def test_a_log_that_hangs_does_not_hold_up_who_is_told_of_the_end(monkeypatch):
         hanging.set()
 
 
-def test_a_log_that_hangs_over_short_moves_is_noticed(monkeypatch):
-    """Each move began to wait anew: none of many short ones was stopped."""
-    monkeypatch.setattr("hw.robot.motion._LOG_HANGS_WALL_S", 1.5)
+@pytest.mark.parametrize("line_s", [30.0, 0.4], ids=["hangs", "slow"])
+def test_a_log_that_falls_behind_over_short_moves_is_noticed(monkeypatch, line_s):
+    """Each move, and each line, began to wait anew; most lines were lost at the end."""
+    monkeypatch.setattr("hw.robot.motion._LOG_BEHIND_WALL_S", 1.5)
     monkeypatch.setattr("hw.robot.motion._ENDING_WALL_S", 0.2)
     hanging = threading.Event()
 
     def log(t: float, command: str, numbers: dict[str, object]) -> None:
-        if command == "moveL":
-            hanging.wait(30.0)
+        hanging.wait(line_s)
 
     def move_on(motion: Motion) -> None:
         for row in (1, 0) * 5:
