@@ -204,6 +204,7 @@ def test_empty_rows_at_the_end_do_not_count(tmp_path):
             ["u", "v", "err [deg]", "marker1", *NAMES[3:], "gain"],
             "columns 3 ('err [deg]'), 4 ('marker1') and 11 ('gain') are not known",
         ),
+        (["u", "v", *MATRIX, "marker1"], "column 15, 'marker1', is not known"),
         (["u", "v", "x", "y", "z", "rx", "ry", "rz"], "column 6, 'rx': rotation vectors"),
         (["u", "v", "x", "y", "z", "roll [deg]"], "column 6, 'roll [deg]': rotation vectors"),
         (["actual_TCP_pose_0", "u", "v"], "convert them to quaternions (docs/how-to/robot.md"),

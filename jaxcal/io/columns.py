@@ -175,7 +175,8 @@ def columns_of_header(names: list[str], quaternion: QuaternionOrder | None) -> C
     translation = _complete(roles, ("x", "y", "z"), "x, y and z")
     matrix = _matrix(rest, list(bases), translation)
     if rest and matrix is None:
-        raise _unknown(names, rest)
+        others = [index for index in rest if not re.fullmatch("m[1-3][1-4]", bases[index])]
+        raise _unknown(names, others or rest)
     if matrix is not None and translation is not None and len(rest) != 9:
         raise FormatError("the header names both a whole matrix and x, y, z")
     if (quaternion_columns is None) != (translation is None) and matrix is None:
