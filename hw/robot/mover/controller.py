@@ -85,7 +85,7 @@ class Controller:
     # Commands
 
     def command(self, name: str, *values: object, within_s: float = _UNHEARD_S) -> object:
-        """One command to the controller; every one is logged before it is sent.
+        """One command to the controller; the caller is told of every one before it is sent.
 
         Args:
             name: of ur_rtde's function.
