@@ -22,7 +22,6 @@ from jaxcal.data.recording import (
     Images,
     Kind,
     Recording,
-    check_enough,
     checked_bound,
     checked_covariance,
     images_of,
@@ -41,7 +40,7 @@ from jaxcal.runtime.arrays import (
     outline,
     static,
 )
-from jaxcal.runtime.given_values import refuse_masked
+from jaxcal.runtime.given_values import check_enough, refuse_masked
 from jaxcal.runtime.jax_modes import importing_jax, in_own_modes
 from jaxcal.runtime.messages import shown
 from jaxcal.runtime.one_or_batch import OneOrBatch
@@ -510,7 +509,7 @@ def check_values(problem: Problem) -> None:
     if not np.isin(mask, (0, 1)).all():
         raise InputError("mask of the problem must hold 1 (used) or 0 (left out) for every image")
     used = mask > 0
-    check_enough(used)
+    check_enough(used, MINIMUM_IMAGES)
     poses = np.asarray(problem.poses)
     if not _are_rigid(poses[used]):
         check_poses(poses, used)  # says which is not, and why

@@ -19,6 +19,7 @@ from jaxcal.data.probe import Probe, check_probe
 from jaxcal.runtime.array_types import Bool, Float, Int
 from jaxcal.runtime.arrays import is_traced
 from jaxcal.runtime.given_values import (
+    check_enough,
     is_number,
     real_array,
     refuse_masked,
@@ -26,7 +27,7 @@ from jaxcal.runtime.given_values import (
     truth_array,
     whole_number,
 )
-from jaxcal.runtime.messages import counted, shown
+from jaxcal.runtime.messages import shown
 
 MINIMUM_IMAGES = 4
 """With fewer used images nothing can be solved: 3 residuals an image against 9 unknowns."""
@@ -424,13 +425,6 @@ def make_images(
         return images
     except InputError as error:
         raise type(error)(f"{prefix}{error}") from None
-
-
-def check_enough(used: np.ndarray, minimum: int = MINIMUM_IMAGES) -> None:
-    """Raise InputError if fewer images are used than so many."""
-    if used.sum() < minimum:
-        few = counted(int(used.sum()), "used image", "is", "are")
-        raise InputError(f"{few} too few: at least {minimum} are needed")
 
 
 def _check_shape(values: np.ndarray, kind: Kind, count: int) -> None:

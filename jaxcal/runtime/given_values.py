@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxcal import InputError
 from jaxcal.runtime.arrays import array_module, is_traced
-from jaxcal.runtime.messages import shown
+from jaxcal.runtime.messages import counted, shown
 
 LARGEST_SEED = 2**63 - 1
 _KEY_DATA = ((2,), (4,))
@@ -74,6 +74,13 @@ def truth_array(value: Any, name: str) -> np.ndarray:
     except (TypeError, ValueError):  # lists of several lengths, or pandas' NA
         pass
     raise InputError(f"{name} must hold booleans (True = used)")
+
+
+def check_enough(used: np.ndarray, minimum: int) -> None:
+    """Raise InputError if fewer images are used than so many."""
+    if used.sum() < minimum:
+        few = counted(int(used.sum()), "used image", "is", "are")
+        raise InputError(f"{few} too few: at least {minimum} are needed")
 
 
 def is_number(value: Any) -> bool:
