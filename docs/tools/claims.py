@@ -105,6 +105,7 @@ def percent(values: Iterable[float]) -> list[float]:
 
 
 ONE_SIDED = {"elevation_distribution": "one-sided"}
+MIXTURE = {"elevation_distribution": "sometimes off-centre"}
 
 
 def tre_span(name: str) -> tuple[float, float]:

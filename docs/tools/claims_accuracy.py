@@ -14,6 +14,7 @@ from claims import (
     FITTED,
     INDEX,
     LAWS,
+    MIXTURE,
     ONE_SIDED,
     PLACED,
     PLANNED,
@@ -393,7 +394,6 @@ claim(
         *tre_span("predicted_over_actual"),
     ),
 )
-MIXTURE = {"elevation_distribution": "sometimes off-centre"}
 for words, law, size in (
     ("a mean in one recording of ten (as `auto` assumes), 1.5 mm", MIXTURE, "1.5"),
     ("a mean in one recording of ten, 5 mm", MIXTURE, "5"),

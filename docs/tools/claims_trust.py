@@ -2,7 +2,20 @@
 
 from __future__ import annotations
 
-from claims import ACCURACY, INDEX, VERDICT, Row, claim, column, number, only, percent, span, table
+from claims import (
+    ACCURACY,
+    INDEX,
+    MIXTURE,
+    VERDICT,
+    Row,
+    claim,
+    column,
+    number,
+    only,
+    percent,
+    span,
+    table,
+)
 
 # Further laws.
 claim(
@@ -48,9 +61,12 @@ claim(
 
 
 # Stated errors.
-def _scales(of: str, method: str, prior: str, law: str = "normal") -> tuple[float, float]:
-    where = {"unknowns": "scale", "method": method, "prior": prior, "elevation_distribution": law}
-    return span(column("tre_calibration_scale", of, **where))
+NORMAL = {"elevation_distribution": "normal"}
+
+
+def _scales(of: str, method: str, prior: str, law: dict[str, str] = NORMAL) -> tuple[float, float]:
+    where = {"unknowns": "scale", "method": method, "prior": prior}
+    return span(column("tre_calibration_scale", of, **where, **law))
 
 
 claim(
@@ -65,7 +81,6 @@ claim(
         *percent(_scales("held_at_points", "joint", "auto")),
     ),
 )
-MIXTURE = "sometimes off-centre"
 claim(
     ACCURACY,
     "Over recordings of which one in ten has a mean, as `auto` assumes, the ratio is {:.2f} to "
@@ -73,7 +88,7 @@ claim(
     lambda: (
         *_scales("predicted_over_actual", "joint", "auto", MIXTURE),
         *percent(_scales("held_at_points", "joint", "auto", MIXTURE)),
-        *set(column("tre_calibration_scale", "trials", elevation_distribution=MIXTURE)),
+        *set(column("tre_calibration_scale", "trials", **MIXTURE)),
     ),
 )
 claim(

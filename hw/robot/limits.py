@@ -50,7 +50,7 @@ CALLER_S = 0.12
 notice it and to slow down the robot rests within 0.2 s."""
 _MOST_CORNERS = 64
 _LEAST_AGE_S = 0.02
-"""A CB controller sends a pose every 8 ms, whose latency is bounded to no less than that."""
+"""A CB controller sends a pose every 8 ms, so the newest one may be this old when it is used."""
 _LEAST_FORCE_N = 2.0
 """The precision of the finest force sensor of the maker's arms (data sheet of the UR3e)."""
 
